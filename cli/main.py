@@ -1,0 +1,77 @@
+"""The ``clipmap`` command: finds the subcommand, turns errors into one sentence and an exit code."""
+
+import os
+import sys
+from importlib import import_module
+from typing import Final
+
+import click
+
+from cli.exit_codes import INTERRUPTED, STORAGE, exit_code
+from schemas.errors import ClipmapError
+
+COMMANDS: Final = {
+    "build": "Build a layer of a dataset from a source image or elevation model.",
+    "inspect": "Show a dataset, a level or a block.",
+    "serve": "Serve datasets over HTTP.",
+    "view": "Render a dataset, in a window or headless.",
+    "demo": "Build, serve and render a built-in terrain.",
+}
+"""Commands and their one-line help. Kept here so that ``clipmap --help`` imports none of them."""
+
+
+class LazyGroup(click.Group):
+    """A group that imports a command's module only when that command is run."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the commands in the order of the work."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Return the command, None if there is no such one."""
+        if cmd_name not in COMMANDS:
+            return None
+        command = import_module(f"cli.commands.{cmd_name}").command
+        if not isinstance(command, click.Command):
+            raise TypeError(cmd_name)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the list of commands without importing them."""
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))
+
+
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(package_name="clipmap", prog_name="clipmap")
+def cli() -> None:
+    """Turn huge satellite images and elevation models into clipmap-ready datasets, and stream them to viewers.
+
+    Exit status: 0 done, 1 a check found something wrong, 2 usage, 3 bad input, 4 reading or writing failed.
+    """
+
+
+def run(arguments: list[str] | None = None) -> int:
+    """Run the command line and return its exit code; a user's mistake ends in one sentence on stderr."""
+    try:
+        result = cli.main(args=arguments, prog_name="clipmap", standalone_mode=False)
+    except click.exceptions.Exit as stop:
+        return stop.exit_code
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("clipmap: interrupted", err=True)
+        return INTERRUPTED
+    except ClipmapError as error:
+        click.echo(f"clipmap: {error}", err=True)
+        return exit_code(error)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return STORAGE
+    return result if isinstance(result, int) else 0
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    sys.exit(run())

@@ -1,0 +1,51 @@
+"""Settings of a build and of a server: frozen, one line and unit per field, passed in, never global."""
+
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from schemas.manifest import LayerKind
+
+Kernel = Literal["blackman-sinc"]
+HeightEncoding = Literal["terrarium", "terrain-rgb"]
+
+
+class Settings(BaseModel):
+    """Base of all settings: immutable, no unknown fields."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class BuildSettings(Settings):
+    """What ``clipmap build`` is told; ``None`` means: chosen from the source."""
+
+    layer: LayerKind | None = Field(default=None, description="Kind of the layer; guessed from the source where safe")
+    block: int = Field(default=256, description="Side of a block's core [samples], a power of two")
+    codec: str | None = Field(default=None, description="Block codec, e.g. jpeg:85, png, webp:90, lerc:0.01")
+    filter: Kernel = Field(default="blackman-sinc", description="Kernel that makes coarser levels")
+    radius: int | None = Field(default=None, ge=1, le=16, description="Kernel radius [coarse samples]; 6 for heights, 3 for imagery")
+    task: int = Field(default=4096, ge=2, description="Side of a task [level-0 samples]; has no effect on the result")
+    workers: int | None = Field(default=None, ge=1, le=256, description="Threads; default: the processors there are; has no effect on the result")
+    nodata: float | None = Field(default=None, description="Value that marks a void in the source; NaN always does")
+    decode: HeightEncoding | None = Field(default=None, description="How heights are hidden in the source's colour channels")
+    height_scale: float = Field(default=1.0, allow_inf_nan=False, description="Metres per unit of the source")
+    height_offset: float = Field(default=0.0, allow_inf_nan=False, description="Metres added after scaling [m]")
+    spacing: float | None = Field(
+        default=None, gt=0, allow_inf_nan=False, description="Distance between samples of a source without georeference [m]"
+    )
+    overwrite: bool = Field(default=False, description="Replace the layer if the dataset has it already")
+
+    @model_validator(mode="after")
+    def _scale_not_zero(self) -> Self:
+        if self.height_scale == 0:
+            raise ValueError("height_scale must not be 0")
+        return self
+
+
+class ServerSettings(Settings):
+    """What ``clipmap serve`` is told."""
+
+    roots: tuple[Path, ...] = Field(min_length=1, description="Datasets, or folders of datasets")
+    host: str = Field(default="127.0.0.1", description="Address to listen on")
+    port: int = Field(default=8000, ge=0, le=65535, description="TCP port to listen on; 0 picks a free one")

@@ -1,0 +1,1 @@
+"""The block service: hands out stored blocks over HTTP without ever decoding them."""

@@ -1,0 +1,1 @@
+"""Numbers and bytes: reads sources, filters levels, cuts, encodes and stores blocks."""
