@@ -13,7 +13,9 @@ from typing import Final
 from schemas.errors import UsageError
 
 LAYER_NAME: Final = re.compile(r"[a-z][a-z0-9_]*")
-_BLOCK_NAME: Final = re.compile(r"(?P<layer>[a-z][a-z0-9_]*)-(?P<level>0|[1-9][0-9]*)(?:-(?P<code>[0-3]+))?\.(?P<suffix>[a-z0-9]+)")
+_BLOCK_NAME: Final = re.compile(
+    r"(?P<layer>[a-z][a-z0-9_]*)-(?P<level>0|[1-9][0-9]{0,3})(?:-(?P<code>[0-3]{1,999}))?\.(?P<suffix>[a-z0-9]+)"
+)
 _QUADCODE: Final = re.compile(r"[0-3]*")
 
 

@@ -5,7 +5,6 @@ is generated from these models.
 """
 
 import base64
-import binascii
 import hashlib
 import json
 import zlib
@@ -14,12 +13,14 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from schemas.address import LAYER_NAME, BlockAddress, block_name
-from schemas.errors import InputError, NotFoundError
+from schemas.errors import InputError, NotFoundError, UsageError
 from schemas.lattice import Lattice, Registration
 
 FORMAT_VERSION = 1
 MANIFEST_NAME = "manifest.json"
 INDEX_NAME = "index.bin"
+MAX_LEVEL_BLOCKS = 1 << 31
+"""So that a few bytes of a hostile manifest cannot make a reader allocate without bound."""
 
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
 Transform = tuple[float, float, float, float, float, float]
@@ -30,7 +31,7 @@ LayerKind = Literal["imagery", "height"]
 class Model(BaseModel):
     """Base of the manifest's parts: immutable, no unknown fields, finite numbers only."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, json_schema_serialization_defaults_required=True)
 
 
 class World(Model):
@@ -50,12 +51,15 @@ class Source(Model):
     channels: int = Field(gt=0, description="Channels of the source, alpha included")
     dtype: str = Field(description="Sample type of the source")
     file_bytes: int = Field(ge=0, description="Size of the source file [bytes]")
-    nodata: float | str | None = Field(description="Value that marks a void, declared by the file or given; 'nan' for NaN; null if none")
+    nodata: float | None = Field(
+        description="Value that marks a void, declared by the file or given, besides NaN and infinities; null if none"
+    )
     decode: Literal["terrarium", "terrain-rgb"] | None = Field(description="How heights were hidden in colour; null if they were not")
     scale: float = Field(description="Factor from source values to layer values (heights: metres per unit)")
     offset: float = Field(description="Added after scaling (heights: metres)")
-    placement: Literal["georeferenced", "spacing", "fitted"] = Field(
-        description="Why the layer lies where it lies: the file says so, --spacing was given, or it was fitted to the dataset's extent"
+    placement: Literal["georeferenced", "spacing", "fitted", "assumed"] = Field(
+        description="Why the layer lies where it lies: the file says so, --spacing was given, it was fitted to the dataset's extent, "
+        "or nothing is known and samples are one unit apart"
     )
 
 
@@ -101,12 +105,15 @@ class Level(Model):
         count = self.columns * self.rows
         size = -(-count // 8)
         if self.availability == "all":
-            return ((1 << count) - 1).to_bytes(size, "little")
+            return b"\xff" * (count // 8) + bytes([(1 << count % 8) - 1] * (size - count // 8))
         try:
             packed = base64.b64decode(self.availability, validate=True)
-            bitmap = zlib.decompressobj().decompress(packed, size + 1)
-        except (binascii.Error, zlib.error) as error:
+            stream = zlib.decompressobj()
+            bitmap = stream.decompress(packed, size + 1)
+        except (ValueError, zlib.error) as error:
             raise InputError(f"manifest: the availability of level {self.level} is damaged ({error}); rebuild the layer") from error
+        if len(bitmap) == size and (not stream.eof or stream.unused_data or int.from_bytes(bitmap, "little") >> count):
+            raise InputError(f"manifest: the availability of level {self.level} is cut off or has bits too many; rebuild the layer")
         if len(bitmap) != size:
             raise InputError(
                 f"manifest: the availability of level {self.level} has {len(bitmap)} bytes instead of {size}; rebuild the layer"
@@ -142,20 +149,20 @@ class Layer(Model):
     media_type: str = Field(description="Media type of a block")
     max_error: float | None = Field(
         ge=0,
-        description="Largest absolute difference a decoded sample may have from the filtered one, rounding to the stored type aside; "
-        "null if not bounded",
+        description="Largest absolute difference a decoded sample may have from the filtered one, rounding to the stored type aside "
+        "[unit of a sample]; null if not bounded",
     )
     transform: Transform = Field(
-        description="(a, b, c, d, e, f): world x = a*col + b*row + c, y = d*col + e*row + f, in level-0 sample coordinates. "
-        "For 'area' whole numbers are cell corners, for 'point' they are the samples"
+        description="(a, b, c, d, e, f): world x = a*col + b*row + c, y = d*col + e*row + f, in level-0 sample coordinates "
+        "[world units]. For 'area' whole numbers are cell corners, for 'point' they are the samples"
     )
     ground_spacing_m: tuple[float, float] | None = Field(
         description="Ground distance between samples along a row and along a column at the layer's centre [m]; null if unknown"
     )
-    filter: Filter
-    source: Source
-    statistics: Statistics
-    levels: list[Level] = Field(min_length=1)
+    filter: Filter = Field(description="How coarser levels are made")
+    source: Source = Field(description="Where the layer came from")
+    statistics: Statistics = Field(description="What level 0 holds")
+    levels: list[Level] = Field(min_length=1, description="All levels, the finest first")
 
     @property
     def lattice(self) -> Lattice:
@@ -164,11 +171,11 @@ class Layer(Model):
 
     def block_key(self, name: str, address: BlockAddress) -> str:
         """Return the store key of a block of this layer, which is called ``name`` in the manifest."""
-        return f"{self.path}/{address.level}/{block_name(name, address, len(self.levels), self.suffix)}"
+        return block_key(self.path, name, address, len(self.levels), self.suffix)
 
     def index_key(self, level: int) -> str:
         """Return the store key of the block index of ``level``."""
-        return f"{self.path}/{level}/{INDEX_NAME}"
+        return index_key(self.path, level)
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
@@ -178,13 +185,29 @@ class Layer(Model):
 
     @model_validator(mode="after")
     def _levels_fit_lattice(self) -> Self:
-        lattice = self.lattice
+        try:
+            lattice = self.lattice
+        except UsageError as error:
+            raise ValueError(str(error)) from error
+        columns, rows = lattice.block_counts(0)
+        if columns * rows > MAX_LEVEL_BLOCKS:
+            raise ValueError(f"level 0 would have {columns} x {rows} blocks, and more than {MAX_LEVEL_BLOCKS} are not supported")
         sizes = [(*lattice.level_size(n), *lattice.block_counts(n)) for n in range(lattice.levels)]
         if [(level.width, level.height, level.columns, level.rows) for level in self.levels] != sizes:
             raise ValueError(f"levels do not fit a lattice of {self.width} x {self.height} samples in blocks of {self.block}")
         if [level.level for level in self.levels] != list(range(lattice.levels)):
             raise ValueError("levels must be listed from 0, without gaps")
         return self
+
+
+def block_key(path: str, name: str, address: BlockAddress, levels: int, suffix: str) -> str:
+    """Return the store key of a block: ``<path>/<level>/<block name>``."""
+    return f"{path}/{address.level}/{block_name(name, address, levels, suffix)}"
+
+
+def index_key(path: str, level: int) -> str:
+    """Return the store key of the block index of a level: ``<path>/<level>/index.bin``."""
+    return f"{path}/{level}/{INDEX_NAME}"
 
 
 def transformed_extent(transform: Transform, width: float, height: float) -> tuple[float, float, float, float]:
@@ -198,11 +221,11 @@ def transformed_extent(transform: Transform, width: float, height: float) -> tup
 class Manifest(Model):
     """The whole dataset; ``version`` is a digest of ``world`` and ``layers``, so equal data have equal versions."""
 
-    format: Literal["clipmap"] = "clipmap"
+    format: Literal["clipmap"] = Field(default="clipmap", description="Tells a manifest from other JSON files")
     format_version: int = Field(default=FORMAT_VERSION, ge=1, description="Readers refuse a greater number than they know")
     generator: str = Field(description="Program and version that wrote the manifest")
     version: Digest = Field(description="Digest of world and layers; changes whenever any block changes")
-    world: World
+    world: World = Field(description="The coordinate system that every layer's transform leads to")
     layers: dict[str, Layer] = Field(min_length=1, description="Layers by name")
 
     @classmethod
@@ -216,6 +239,8 @@ class Manifest(Model):
         for name in self.layers:
             if not LAYER_NAME.fullmatch(name):
                 raise ValueError(f"layer name {name!r}: use lower-case letters, digits and underscores, a letter first")
+        if len({layer.path for layer in self.layers.values()}) < len(self.layers):
+            raise ValueError("two layers have the same path")
         if self.version != _version(self.world, self.layers):
             raise ValueError("version does not match the content; the file was edited or damaged")
         return self
@@ -246,12 +271,14 @@ def parse_manifest(data: bytes, where: str) -> Manifest:
     """Return the manifest in ``data``; raises InputError that names ``where`` and the first thing that is wrong."""
     try:
         raw = json.loads(data)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{where}: not a manifest: {error}") from error
     if not isinstance(raw, dict) or raw.get("format") != "clipmap":
         raise InputError(f"{where}: not a clipmap manifest (no 'format': 'clipmap')")
     found = raw.get("format_version")
-    if isinstance(found, int) and found > FORMAT_VERSION:
+    if type(found) is not int:
+        raise InputError(f"{where}: no whole number as 'format_version': not a clipmap manifest, or a damaged one")
+    if found > FORMAT_VERSION:
         raise InputError(f"{where}: format version {found} is newer than this clipmap reads ({FORMAT_VERSION}); upgrade clipmap")
     try:
         return Manifest.model_validate(raw)

@@ -25,8 +25,11 @@ class BuildSettings(Settings):
     codec: str | None = Field(default=None, description="Block codec, e.g. jpeg:85, png, webp:90, lerc:0.01")
     filter: Kernel = Field(default="blackman-sinc", description="Kernel that makes coarser levels")
     radius: int | None = Field(default=None, ge=1, le=16, description="Kernel radius [coarse samples]; 6 for heights, 3 for imagery")
-    task: int = Field(default=4096, ge=2, description="Side of a task [level-0 samples]; has no effect on the result")
-    workers: int | None = Field(default=None, ge=1, le=256, description="Threads; default: the processors there are; has no effect on the result")
+    task: int = Field(default=2048, ge=2, description="Side of a task [level-0 samples]; has no effect on the result")
+    workers: int | None = Field(
+        default=None, ge=1, le=256, description="Threads; default: the processors there are; has no effect on the result"
+    )
+    bands: tuple[int, ...] | None = Field(default=None, min_length=1, max_length=4, description="Channels to take, from 1; all by default")
     nodata: float | None = Field(default=None, description="Value that marks a void in the source; NaN always does")
     decode: HeightEncoding | None = Field(default=None, description="How heights are hidden in the source's colour channels")
     height_scale: float = Field(default=1.0, allow_inf_nan=False, description="Metres per unit of the source")
@@ -37,9 +40,11 @@ class BuildSettings(Settings):
     overwrite: bool = Field(default=False, description="Replace the layer if the dataset has it already")
 
     @model_validator(mode="after")
-    def _scale_not_zero(self) -> Self:
+    def _sensible(self) -> Self:
         if self.height_scale == 0:
             raise ValueError("height_scale must not be 0")
+        if self.bands is not None and min(self.bands) < 1:
+            raise ValueError("bands are counted from 1")
         return self
 
 

@@ -4,7 +4,8 @@ A codec string is ``name`` or ``name:parameters``, e.g. ``jpeg:85`` or ``lerc:0.
 state and may be used from several threads; encoding and decoding release the GIL in their libraries.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Final, Protocol
@@ -12,7 +13,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.errors import UsageError
+from schemas.errors import InputError, UsageError
 from schemas.manifest import LayerKind, SampleType
 
 Samples = NDArray[Any]
@@ -76,6 +77,23 @@ class Codec(Protocol):
         Void samples decode to 0.
         """
         ...
+
+
+@contextmanager
+def decoding(spec: str) -> Iterator[None]:
+    """Turn what a codec library raises on damaged bytes into one InputError."""
+    try:
+        yield
+    except (RuntimeError, ValueError, KeyError, OSError, MemoryError) as error:
+        raise InputError(f"a {spec} block cannot be decoded, its bytes are damaged: {error}") from error
+
+
+def checked(samples: Samples, block: BlockFormat, spec: str) -> Samples:
+    """Return ``samples`` if their shape and dtype are the block's, else raise InputError with expected and found."""
+    expected = (block.side, block.side, block.channels)
+    if samples.shape != expected or samples.dtype != block.dtype:
+        raise InputError(f"a {spec} block holds {samples.shape} {samples.dtype} instead of {expected} {block.dtype}; it is damaged")
+    return samples
 
 
 Factory = Callable[[BlockFormat, str], Codec]

@@ -59,16 +59,24 @@ class Dataset:
         return data
 
 
+def read_manifest(store: Store) -> Manifest | None:
+    """Return the manifest of the dataset in ``store``, None if there is none; raises InputError if it cannot be understood."""
+    try:
+        data = store.read(MANIFEST_NAME)
+    except NotFoundError:
+        return None
+    return parse_manifest(data, f"{store.location}/{MANIFEST_NAME}")
+
+
 def open_dataset(path: Path) -> Dataset:
     """Open the dataset in the directory ``path``.
 
     Raises NotFoundError if there is no manifest, InputError if it cannot be understood.
     """
     store = DirectoryStore(path)
-    try:
-        data = store.read(MANIFEST_NAME)
-    except NotFoundError:
-        if (path / MANIFEST_NAME).parent.is_dir() and any(path.iterdir()):
-            raise NotFoundError(f"{path}: no {MANIFEST_NAME}: not a dataset, or its build has not finished") from None
-        raise NotFoundError(f"{path}: no dataset there (no {MANIFEST_NAME})") from None
-    return Dataset(store, parse_manifest(data, f"{path / MANIFEST_NAME}"))
+    manifest = read_manifest(store)
+    if manifest is None:
+        if path.is_dir() and any(path.iterdir()):
+            raise NotFoundError(f"{path}: no {MANIFEST_NAME}: not a dataset, or its build has not finished")
+        raise NotFoundError(f"{path}: no dataset there (no {MANIFEST_NAME})")
+    return Dataset(store, manifest)

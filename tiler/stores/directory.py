@@ -1,17 +1,21 @@
 """A store in a directory: one file per key, written to a temporary name and renamed."""
 
+import fcntl
 import os
 import shutil
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from schemas.errors import NotFoundError, StorageError
 
 _TEMPORARY = ".tmp-"
+_LOCK = ".lock"
 
 
 class DirectoryStore:
-    """Keys are file paths below ``root``; the directory is created by the first write.
+    """Keys are file paths below ``root``; the directory is created by the first write. Hidden names (``.x``) are no keys.
 
     ``write`` renames a finished temporary file over the key, so a killed process leaves at most files whose
     names begin with ``.tmp-``, which no reader sees.
@@ -28,7 +32,7 @@ class DirectoryStore:
 
     def _path(self, key: str) -> Path:
         parts = key.split("/")
-        if not key or any(part in ("", ".", "..") or part.startswith(_TEMPORARY) for part in parts):
+        if not key or any(not part or part.startswith(".") for part in parts):
             raise NotFoundError(f"{self._root}: {key!r} is not a key of a store")
         return self._root.joinpath(*parts)
 
@@ -85,9 +89,47 @@ class DirectoryStore:
             (Path(parent) / name).relative_to(self._root).as_posix()
             for parent, _, names in os.walk(folder)
             for name in names
-            if not name.startswith(_TEMPORARY)
+            if not name.startswith(".")
         )
 
     def sync(self) -> None:
         """Flush what was written to the disk, so that a manifest never survives a power cut that its blocks did not."""
         os.sync()
+
+    @contextmanager
+    def exclusive(self) -> Iterator[bool]:
+        """Keep other builds out of the store; gives True if the last one was killed and left its lock file behind.
+
+        The lock is the kernel's (``flock``), so it ends with the process however that ends. Makes the directory if there is
+        none, and removes it again if nothing was put in. Raises StorageError if another build is at work or the directory cannot
+        be made.
+        """
+        path = self._root / _LOCK
+        try:
+            self._root.mkdir(parents=True, exist_ok=True)
+            abandoned = path.exists()
+            descriptor = self._locked(path)
+        except OSError as error:
+            raise StorageError(f"{self._root}: cannot be written: {error.strerror}") from error
+        try:
+            yield abandoned
+        finally:
+            path.unlink(missing_ok=True)
+            os.close(descriptor)
+            with suppress(OSError):
+                self._root.rmdir()
+
+    def _locked(self, path: Path) -> int:
+        while True:
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                owner = os.pread(descriptor, 20, 0).decode("ascii", "replace") or "unknown"
+                os.close(descriptor)
+                raise StorageError(f"{self._root}: another build is writing here (process {owner}); wait until it has ended") from None
+            if path.exists() and os.path.samestat(os.fstat(descriptor), path.stat()):
+                os.ftruncate(descriptor, 0)
+                os.pwrite(descriptor, str(os.getpid()).encode(), 0)
+                return descriptor
+            os.close(descriptor)  # its owner removed the file between our opening and locking it

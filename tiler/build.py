@@ -1,0 +1,258 @@
+"""Building a layer: source, plan, tasks, manifest. The manifest is written last and in one step."""
+
+import resource
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from time import perf_counter
+from typing import Final
+
+import numpy as np
+
+from schemas.errors import StorageError, UsageError
+from schemas.manifest import MANIFEST_NAME, Filter, Layer, Manifest, index_key
+from schemas.manifest import Source as SourceEntry
+from schemas.region import Rect
+from schemas.settings import BuildSettings
+from tiler.cascade import Cascade, Coverage, Values, held_windows
+from tiler.cut import Cutter, StageTimes, Target
+from tiler.engine import run_tasks
+from tiler.ledger import Ledger
+from tiler.plan import Plan, plan_layer
+from tiler.rowfile import RowFile
+from tiler.sources.convert import Source, choose_conversion
+from tiler.sources.files import open_file
+from tiler.stores.dataset import read_manifest
+from tiler.stores.directory import DirectoryStore
+from tiler.tasks import Task, plan_tasks
+
+Progress = Callable[[int, int], None]
+"""Called with (blocks finished, blocks in all), from any thread, one call at a time."""
+
+_PORTION_ROWS: Final = 256
+_MAX_PORTION_ROWS: Final = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class BuildReport:
+    """What a build did: the new manifest, the layer's name, remarks for the user, and what it cost."""
+
+    manifest: Manifest
+    layer: str
+    remarks: tuple[str, ...]
+    times: StageTimes
+    wall_s: float
+    megasamples: float
+    peak_rss_bytes: int
+
+
+def build_layer(path: Path, output: Path, settings: BuildSettings, on_progress: Progress = lambda done, total: None) -> BuildReport:
+    """Build one layer of the dataset in the directory ``output`` from the file ``path``, and publish it.
+
+    The dataset is made if it does not exist. Until the manifest is replaced, readers see the old dataset, or none. Raises
+    UsageError, InputError or StorageError; then, and when interrupted, nothing of the unfinished layer is kept.
+    """
+    started = perf_counter()
+    store = DirectoryStore(output)
+    with store.exclusive() as abandoned:
+        dataset = read_manifest(store)
+        if dataset is None and not abandoned:
+            _refuse_foreign(output)
+        reader = open_file(path, output)
+        try:
+            plan = plan_layer(Source(reader, choose_conversion(reader.info, settings)), dataset, settings)
+            manifest, times = _build(plan, store, dataset, output, on_progress)
+        finally:
+            reader.close()
+    return BuildReport(
+        manifest=manifest,
+        layer=plan.name,
+        remarks=_remarks(plan, manifest.layers[plan.name]),
+        times=times,
+        wall_s=perf_counter() - started,
+        megasamples=plan.lattice.width * plan.lattice.height / 1e6,
+        peak_rss_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+    )
+
+
+def _refuse_foreign(output: Path) -> None:
+    """Refuse a folder that holds something else than a dataset: a build deletes what an unfinished one left behind."""
+    if foreign := sorted(entry.name for entry in output.iterdir() if not entry.name.startswith(".")):
+        raise UsageError(f"{output}: not a dataset, and not empty (it holds {foreign[0]}); choose another folder for -o")
+
+
+def _build(
+    plan: Plan, store: DirectoryStore, dataset: Manifest | None, scratch: Path, on_progress: Progress
+) -> tuple[Manifest, StageTimes]:
+    target = Target(store, _unused_path(plan.name, dataset), plan.name, plan.lattice, plan.block, plan.codec)
+    ledger = Ledger(plan.lattice, plan.source.conversion.channels, on_progress)
+    store.delete_prefix(target.path)
+    try:
+        times = _run_tiers(plan, target, ledger, scratch)
+        manifest = _publish(plan, target, ledger, dataset)
+    except BaseException:
+        with suppress(StorageError):
+            store.delete_prefix(target.path)
+        raise
+    if dataset is not None and plan.name in dataset.layers:
+        store.delete_prefix(dataset.layers[plan.name].path)
+    return manifest, times
+
+
+def _unused_path(name: str, dataset: Manifest | None) -> str:
+    """Return a prefix no published layer uses, so that a rebuild leaves the old blocks alone until it is done."""
+    used = set() if dataset is None else {layer.path for layer in dataset.layers.values()}
+    return next(path for path in (name, f"{name}.2") if path not in used)
+
+
+class _Carried:
+    """The float32 samples of a level that lies between two tiers, with their coverage as one more channel."""
+
+    def __init__(self, size: tuple[int, int], channels: int, masked: bool, scratch: Path) -> None:
+        self._masked = masked
+        self._channels = channels
+        self._rows = RowFile(*size, channels + masked, np.dtype(np.float32), scratch)
+        self.close = self._rows.close
+
+    def write(self, x: int, y: int, values: Values, coverage: Coverage | None) -> None:
+        """Keep samples with their top-left one at (x, y)."""
+        self._rows.write(x, y, values if coverage is None else np.concatenate([values, coverage[..., np.newaxis]], axis=-1))
+
+    def read(self, window: Rect) -> tuple[Values, Coverage | None]:
+        """Return values (rows, columns, channels) and coverage of a window."""
+        rows = self._rows.read(window)
+        if not self._masked:
+            return rows, None
+        return np.ascontiguousarray(rows[..., : self._channels]), np.ascontiguousarray(rows[..., self._channels])
+
+
+Samples = Source | _Carried
+
+
+def _run_tiers(plan: Plan, target: Target, ledger: Ledger, scratch: Path) -> StageTimes:
+    times = StageTimes()
+    samples: Samples = plan.source
+    for tier in plan.tiers:
+        carried = None
+        if tier.carry:
+            size = plan.lattice.level_size(tier.first + tier.count)
+            carried = _Carried(size, plan.source.conversion.channels, plan.recipe.masked, scratch)
+        try:
+            work = _TaskRunner(plan, target, ledger, samples, carried)
+            for part in run_tasks(work, plan_tasks(plan.lattice, tier, plan.source.info.layout), plan.workers):
+                times.add(part)
+        finally:
+            if isinstance(samples, _Carried):
+                samples.close()
+        if carried is not None:
+            samples = carried
+    return times
+
+
+class _TaskRunner:
+    """Runs one task: reads its window in portions, filters, cuts and stores its blocks, keeps its piece for the next tier."""
+
+    def __init__(self, plan: Plan, target: Target, ledger: Ledger, samples: Samples, carried: _Carried | None) -> None:
+        self._plan, self._target, self._ledger = plan, target, ledger
+        self._samples, self._carried = samples, carried
+        chunk = plan.source.info.chunk_rows
+        # Portions end where the file's tiles do, or each tile would be decoded twice.
+        self._portion_rows = min(max(1, _PORTION_ROWS // chunk) * chunk, _MAX_PORTION_ROWS)
+
+    def __call__(self, task: Task) -> StageTimes:
+        """Run ``task``; returns the seconds it took by stage."""
+        plan, tier = self._plan, task.tier
+        size = plan.lattice.level_size(tier.first)
+        windows = held_windows(size, task.core, tier.count + tier.carry, plan.recipe.kernel.reach)
+        cutter = Cutter(self._target, tier.first, task.core, self._ledger.note)
+
+        def sink(step: int, first: int, values: Values, coverage: Coverage | None) -> None:
+            if step < tier.count:
+                cutter.take(tier.first + step, first, values, coverage, windows[step].x0)
+            elif self._carried is not None:
+                self._carried.write(windows[step].x0, first, values, coverage)
+
+        cascade = Cascade(size, windows, plan.source.conversion.channels, plan.recipe, sink)
+        whole, times = windows[0], cutter.times
+        started = perf_counter()
+        y = whole.y0
+        while y < whole.y1:
+            end = min(whole.y1, (y // self._portion_rows + 1) * self._portion_rows)
+            before_read = perf_counter()
+            values, coverage = self._samples.read(Rect(whole.x0, y, whole.x1, end))
+            times.read_s += perf_counter() - before_read
+            cascade.push(values, coverage)
+            y = end
+        times.filter_s = perf_counter() - started - times.read_s - times.encode_s - times.write_s
+        return times
+
+
+def _publish(plan: Plan, target: Target, ledger: Ledger, dataset: Manifest | None) -> Manifest:
+    for level in range(plan.lattice.levels):
+        target.store.write(index_key(target.path, level), ledger.index(level))
+    layers = {} if dataset is None else dict(dataset.layers)
+    layers[plan.name] = _layer_entry(plan, target, ledger)
+    manifest = Manifest.create(generator=f"clipmap {version('clipmap')}", world=plan.placement.world, layers=layers)
+    target.store.sync()
+    target.store.write(MANIFEST_NAME, manifest.to_json())
+    target.store.sync()
+    return manifest
+
+
+def _layer_entry(plan: Plan, target: Target, ledger: Ledger) -> Layer:
+    kernel = plan.recipe.kernel
+    return Layer(
+        kind=plan.block.kind,
+        path=target.path,
+        registration=plan.lattice.registration,
+        width=plan.lattice.width,
+        height=plan.lattice.height,
+        block=plan.lattice.block,
+        pad=plan.lattice.pad,
+        channels=plan.block.channels,
+        alpha=plan.block.alpha,
+        dtype=plan.block.dtype,
+        unit="metre" if plan.block.kind == "height" else None,
+        codec=plan.codec.spec,
+        suffix=plan.codec.suffix,
+        media_type=plan.codec.media_type,
+        max_error=plan.codec.max_error,
+        transform=plan.placement.transform,
+        ground_spacing_m=plan.placement.ground_spacing_m,
+        filter=Filter(kernel="blackman-sinc", radius=kernel.radius, edge=plan.recipe.edge),
+        source=_source_entry(plan),
+        statistics=ledger.statistics(),
+        levels=[ledger.level(level) for level in range(plan.lattice.levels)],
+    )
+
+
+def _source_entry(plan: Plan) -> SourceEntry:
+    info, conversion = plan.source.info, plan.source.conversion
+    return SourceEntry(
+        name=info.path.name,
+        format=info.format,
+        width=info.width,
+        height=info.height,
+        channels=info.channels,
+        dtype=info.dtype.name,
+        file_bytes=info.file_bytes,
+        nodata=conversion.nodata,
+        decode=conversion.decode,
+        scale=conversion.scale,
+        offset=conversion.offset,
+        placement=plan.placement.how,
+    )
+
+
+def _remarks(plan: Plan, layer: Layer) -> tuple[str, ...]:
+    """Return what the user should know although nothing is wrong."""
+    remarks = []
+    if plan.placement.how == "fitted":
+        remarks.append(f"{plan.source.info.path.name} has no georeference: spread over the dataset's extent")
+    if plan.placement.how == "assumed":
+        remarks.append(f"{plan.source.info.path.name} has no georeference and no --spacing: samples lie one unit apart")
+    if layer.statistics.valid == 0:
+        remarks.append(f"{plan.source.info.path.name} has no valid sample: every block is blank")
+    return tuple(remarks)

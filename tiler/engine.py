@@ -1,0 +1,33 @@
+"""Where tasks run: on threads of this machine. Kernels, codecs and readers release the GIL."""
+
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from typing import TypeVar
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+
+def run_tasks(work: Callable[[Task], Result], tasks: Iterable[Task], workers: int) -> Iterator[Result]:
+    """Yield the results of ``work`` on every task, as they come, with at most ``workers`` at a time.
+
+    Tasks are taken from the iterable only when a worker is free. The first error ends the run once the tasks under way have
+    ended, and is raised.
+    """
+    waiting = iter(tasks)
+    running: set[Future[Result]] = set()
+    with ThreadPoolExecutor(workers, thread_name_prefix="clipmap") as pool:
+        try:
+            while True:
+                for task in waiting:
+                    running.add(pool.submit(work, task))
+                    if len(running) >= workers:
+                        break
+                if not running:
+                    return
+                done, running = wait(running, return_when=FIRST_COMPLETED)
+                for future in done:
+                    yield future.result()
+        finally:
+            for future in running:
+                future.cancel()

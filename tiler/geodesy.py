@@ -1,0 +1,31 @@
+"""Distances on the ground: how far apart the samples of a layer are on the WGS 84 ellipsoid (GeographicLib, Karney 2013)."""
+
+import numpy as np
+from geographiclib.geodesic import Geodesic
+from rasterio.errors import RasterioError
+from rasterio.warp import transform as reproject
+
+from schemas.manifest import Transform
+
+
+def ground_spacing_m(transform: Transform, crs: str | None, column: float, row: float) -> tuple[float, float] | None:
+    """Return the ground distances [m] between samples along a row and along a column at sample (column, row).
+
+    The distance is that between the places half a sample to either side, so it is right for geographic coordinates and for
+    projections that stretch (EPSG:3857 by 1 / cos latitude). None if the coordinate system is unknown or cannot be inverted there.
+    """
+    if crs is None:
+        return None
+    a, b, c, d, e, f = transform
+    columns = np.array([column - 0.5, column + 0.5, column, column])
+    rows = np.array([row, row, row - 0.5, row + 0.5])
+    try:
+        longitudes, latitudes = reproject(crs, "EPSG:4326", (a * columns + b * rows + c).tolist(), (d * columns + e * rows + f).tolist())
+    except RasterioError:
+        return None
+    if not np.isfinite([*longitudes, *latitudes]).all() or max(map(abs, latitudes)) > 90:
+        return None
+    east, south = (
+        Geodesic.WGS84.Inverse(latitudes[i], longitudes[i], latitudes[i + 1], longitudes[i + 1], Geodesic.DISTANCE)["s12"] for i in (0, 2)
+    )
+    return float(east), float(south)

@@ -1,0 +1,75 @@
+"""Sources: what a picture or elevation file declares, and windows of its pixels.
+
+``files`` opens a file with the best reader for it; ``convert`` turns raw pixels into float32 samples and coverage.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.manifest import Transform
+from schemas.region import Rect
+
+Pixels = NDArray[Any]
+Layout = Literal["tiled", "striped", "sequential"]
+"""How pixels can be had: any window at the cost of its tiles, full-width bands, or only from top to bottom."""
+
+
+@dataclass(frozen=True, slots=True)
+class Georeference:
+    """Where a file says it lies; ``transform`` leads from pixel corners (column, row) to coordinates of ``crs``."""
+
+    crs: str | None
+    unit: Literal["metre", "degree", "foot", "us-foot", "unknown"]
+    transform: Transform
+
+
+@dataclass(frozen=True, slots=True)
+class FileInfo:
+    """What a file declares, read from its header only."""
+
+    path: Path
+    format: str
+    width: int
+    height: int
+    channels: int
+    dtype: np.dtype[Any]
+    file_bytes: int
+    layout: Layout
+    chunk_rows: int
+    """Rows that are decoded together: a tile's or strip's height."""
+    alpha: int | None = None
+    """Which channel is alpha, from 0."""
+    premultiplied: bool = False
+    """Whether colour was multiplied by alpha before it was stored."""
+    nodata: float | None = None
+    has_mask: bool = False
+    georeference: Georeference | None = None
+
+    @property
+    def rect(self) -> Rect:
+        """All pixels."""
+        return Rect(0, 0, self.width, self.height)
+
+
+class Reader(Protocol):
+    """Windows of a file's raw pixels, from any thread. Every implementation passes ``tests/contract/test_readers.py``."""
+
+    @property
+    def info(self) -> FileInfo:
+        """What the file declares."""
+        ...
+
+    def read(self, window: Rect) -> tuple[Pixels, NDArray[np.uint8] | None]:
+        """Return pixels (rows, columns, channels) of the file's dtype and the file's mask (0 void, 255 valid), None if it has none.
+
+        ``window`` must lie inside the file. Raises InputError if the file cannot be read there.
+        """
+        ...
+
+    def close(self) -> None:
+        """Free handles and scratch files."""
+        ...

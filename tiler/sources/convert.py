@@ -1,0 +1,200 @@
+"""From a file's pixels to samples: channel choice, voids, alpha, heights hidden in colour, units.
+
+Samples are float32 with a coverage between 0 (void) and 1. Void samples are set to 0, so that what lay under them cannot
+reach any result.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.errors import InputError, UsageError
+from schemas.manifest import LayerKind
+from schemas.region import Rect
+from schemas.settings import BuildSettings, HeightEncoding
+from tiler.sources import FileInfo, Pixels, Reader
+
+_EXACT_INTEGERS: Final = 2**24
+"""Whole numbers up to here survive the conversion to float32."""
+
+
+@dataclass(frozen=True, slots=True)
+class Conversion:
+    """How pixels of one file become samples of one layer; ``colours`` are the channels taken, from 0, ``alpha`` one more or None."""
+
+    kind: LayerKind
+    colours: tuple[int, ...]
+    alpha: int | None
+    premultiplied: bool
+    nodata: float | None
+    decode: HeightEncoding | None
+    scale: float
+    offset: float
+
+    @property
+    def channels(self) -> int:
+        """Channels of a sample, alpha not counted."""
+        return 1 if self.decode else len(self.colours)
+
+
+class Source:
+    """A file seen as samples of one layer: windows as float32 (rows, columns, channels) and coverage, from any thread."""
+
+    def __init__(self, reader: Reader, conversion: Conversion) -> None:
+        self.info: FileInfo = reader.info
+        self.conversion = conversion
+        self._reader = reader
+
+    @property
+    def masked(self) -> bool:
+        """Whether samples may be void or transparent; decided by the header, so that all windows agree."""
+        info, conversion = self.info, self.conversion
+        return conversion.alpha is not None or conversion.nodata is not None or info.has_mask or info.dtype.kind == "f"
+
+    def read(self, window: Rect) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """Return samples and coverage (rows, columns), None unless ``masked``; raises InputError if the file cannot be read."""
+        pixels, mask = self._reader.read(window)
+        colours = _chosen(pixels, self.conversion.colours)
+        coverage = self._coverage(pixels, colours, mask) if self.masked else None
+        return self._values(colours, coverage), coverage
+
+    def close(self) -> None:
+        """Close the file."""
+        self._reader.close()
+
+    def _coverage(self, pixels: Pixels, colours: Pixels, mask: NDArray[np.uint8] | None) -> NDArray[np.float32]:
+        coverage = np.ones(pixels.shape[:2], np.float32)
+        if self.conversion.alpha is not None:
+            alpha = pixels[..., self.conversion.alpha]
+            coverage = alpha.astype(np.float32)
+            if alpha.dtype.kind == "u":
+                coverage /= np.float32(np.iinfo(alpha.dtype).max)
+            coverage = np.clip(np.nan_to_num(coverage, nan=0.0), 0, 1)
+        if mask is not None:
+            coverage *= mask.astype(np.float32) / np.float32(255)
+        if self.conversion.nodata is not None:
+            # Compared in the file's own type, before any conversion: -32768 or 1.7e38 would not survive one.
+            coverage[(colours == _in_dtype(self.conversion.nodata, colours.dtype)).all(axis=-1)] = 0
+        if colours.dtype.kind == "f":
+            coverage[~np.isfinite(colours).all(axis=-1)] = 0
+        return coverage
+
+    def _values(self, colours: Pixels, coverage: NDArray[np.float32] | None) -> NDArray[np.float32]:
+        conversion = self.conversion
+        if coverage is not None:
+            colours = np.where(coverage[..., np.newaxis] > 0, colours, colours.dtype.type(0))
+        if (
+            colours.dtype.kind in "iu"
+            and colours.dtype.itemsize > 2
+            and np.abs(colours.astype(np.float64)).max(initial=0) > _EXACT_INTEGERS
+        ):
+            raise InputError(f"{self.info.path}: whole numbers beyond {_EXACT_INTEGERS} would be rounded; scale the file down first")
+        if conversion.decode:
+            return _decoded(colours, conversion)
+        if (conversion.scale, conversion.offset) != (1.0, 0.0):
+            values = (colours.astype(np.float64) * conversion.scale + conversion.offset).astype(np.float32)
+        else:
+            values = np.ascontiguousarray(colours, np.float32)
+        if coverage is not None and (conversion.scale, conversion.offset) != (1.0, 0.0):
+            values[coverage == 0] = 0
+        if conversion.premultiplied and coverage is not None:
+            np.divide(values, coverage[..., np.newaxis], out=values, where=coverage[..., np.newaxis] > 0)
+        return values
+
+
+def _chosen(pixels: Pixels, channels: tuple[int, ...]) -> Pixels:
+    if channels == tuple(range(channels[0], channels[0] + len(channels))):
+        return pixels[..., channels[0] : channels[0] + len(channels)]
+    return pixels[..., list(channels)]
+
+
+def _in_dtype(value: float, dtype: np.dtype[Any]) -> float:
+    return float(dtype.type(value)) if dtype.kind == "f" else value
+
+
+def _decoded(colours: Pixels, conversion: Conversion) -> NDArray[np.float32]:
+    """Return heights from colour: terrarium R*256 + G + B/256 - 32768, terrain-RGB -10000 + (R*65536 + G*256 + B) / 10 [m]."""
+    red, green, blue = (colours[..., channel].astype(np.float64) for channel in range(3))
+    if conversion.decode == "terrarium":
+        heights = red * 256 + green + blue / 256 - 32768
+    else:
+        heights = (red * 65536 + green * 256 + blue) / 10 - 10000
+    return (heights * conversion.scale + conversion.offset).astype(np.float32)[..., np.newaxis]
+
+
+def choose_conversion(info: FileInfo, settings: BuildSettings) -> Conversion:
+    """Return how the file becomes a layer, as ``settings`` say or the file suggests.
+
+    Raises UsageError or InputError with what to do if file and settings do not go together.
+    """
+    chosen = tuple(range(info.channels)) if settings.bands is None else tuple(band - 1 for band in settings.bands)
+    if max(chosen) >= info.channels:
+        raise UsageError(f"{info.path}: no channel {max(chosen) + 1}, it has {info.channels}; correct --bands")
+    alpha = info.alpha if settings.bands is None or info.alpha in chosen else None
+    colours = tuple(channel for channel in chosen if channel != alpha)
+    kind = settings.layer or _guessed_kind(info, colours)
+    if kind == "height":
+        _check_height(info, colours, settings)
+    else:
+        _check_imagery(info, colours, settings)
+    return Conversion(
+        kind=kind,
+        colours=colours[:3] if settings.decode else colours,
+        alpha=alpha,
+        premultiplied=info.premultiplied and alpha is not None,
+        nodata=_nodata(info, settings),
+        decode=settings.decode,
+        scale=settings.height_scale if kind == "height" else 1.0,
+        offset=settings.height_offset if kind == "height" else 0.0,
+    )
+
+
+def _guessed_kind(info: FileInfo, colours: tuple[int, ...]) -> LayerKind:
+    if len(colours) == 1 and info.dtype.kind in "if":
+        return "height"
+    if len(colours) == 3 and info.dtype.kind == "u":
+        return "imagery"
+    raise UsageError(
+        f"{info.path}: {len(colours)} channel(s) of {info.dtype} could be imagery or heights; say --layer imagery or --layer height"
+    )
+
+
+def _check_height(info: FileInfo, colours: tuple[int, ...], settings: BuildSettings) -> None:
+    if settings.decode:
+        if len(colours) != 3 or info.dtype != np.uint8:
+            raise InputError(f"{info.path}: --decode {settings.decode} needs 3 channels of uint8, not {len(colours)} of {info.dtype}")
+    elif len(colours) != 1:
+        raise InputError(
+            f"{info.path}: heights have one channel, this has {len(colours)}; give --decode terrain-rgb or --decode terrarium "
+            "if its colours encode heights, or choose a channel with --bands"
+        )
+    if info.dtype.kind not in "iuf":
+        raise InputError(f"{info.path}: samples of type {info.dtype} are not heights")
+
+
+def _check_imagery(info: FileInfo, colours: tuple[int, ...], settings: BuildSettings) -> None:
+    if settings.decode or (settings.height_scale, settings.height_offset) != (1.0, 0.0):
+        raise UsageError("--decode, --height-scale and --height-offset are for heights; add --layer height or leave them out")
+    if info.dtype not in (np.uint8, np.uint16):
+        raise InputError(
+            f"{info.path}: imagery has 8 or 16 bits without sign, this is {info.dtype}; convert it, e.g. with "
+            "gdal_translate -ot Byte -scale, or build it with --layer height if its samples are heights"
+        )
+    if len(colours) not in (1, 3):
+        raise InputError(
+            f"{info.path}: imagery has 1 or 3 colour channels and perhaps alpha, this has {len(colours)}; "
+            "choose with --bands, e.g. --bands 1,2,3"
+        )
+
+
+def _nodata(info: FileInfo, settings: BuildSettings) -> float | None:
+    """Return the value that marks voids, None if there is none or no sample of the file's type can have it."""
+    value = info.nodata if settings.nodata is None else settings.nodata
+    if value is None or not np.isfinite(value):
+        return None
+    if info.dtype.kind == "f":
+        return value
+    limits = np.iinfo(info.dtype)
+    return value if value == int(value) and limits.min <= value <= limits.max else None

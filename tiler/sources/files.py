@@ -1,0 +1,78 @@
+"""Opening a file: which reader it gets, and whether its declared size can be true."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from schemas.errors import InputError
+from tiler.sources import FileInfo, Reader, geo, oiio
+from tiler.sources.geo import RasterioReader
+from tiler.sources.oiio import OiioReader
+from tiler.sources.spool import SpooledReader
+
+_MAX_EXPANSION = 2000
+"""Largest credible ratio of decoded to stored bytes: deflate reaches 1032, JPEG about 1000 on a constant picture."""
+_BOUNDED_EXPANSION = {"png", "jpeg", "bmp", "gif", "pnm", "targa", "tga", "dpx", "cineon"}
+_BETTER_WITH_RASTERIO = {"jpeg2000", "JP2OpenJPEG", "JP2KAK", "JP2ECW"}
+"""Formats that OpenImageIO decodes as a whole and GDAL by window."""
+_PICTURE_DRIVERS = {"PNG", "JPEG", "GIF", "BMP"}
+"""GDAL drivers for formats of which OpenImageIO has the last word: it notices truncation."""
+
+
+def open_file(path: Path, scratch: Path) -> Reader:
+    """Open ``path`` for windowed reading; only its header is read, unless its format cannot be read by window.
+
+    Such a file is decoded once into memory or into ``scratch``. Raises InputError if the file does not exist, is of no known
+    format, damaged, or declares more pixels than its bytes can hold.
+    """
+    _check_readable(path)
+    geographic = geo.describe(path)
+    if geographic is not None:
+        _check_declared_size(geographic)
+        if geographic.has_mask or geographic.format in _BETTER_WITH_RASTERIO:
+            return RasterioReader(geographic)
+    try:
+        picture = oiio.describe(path)
+    except InputError as error:
+        if geographic is None:
+            raise InputError(f"{error}; neither OpenImageIO nor GDAL can read it") from error
+        if geographic.format in _PICTURE_DRIVERS:
+            raise
+        return _windowed(RasterioReader(geographic), scratch)
+    _check_declared_size(picture)
+    if geographic is None:
+        return _windowed(OiioReader(picture), scratch)
+    if (geographic.width, geographic.height) != (picture.width, picture.height):
+        return _windowed(RasterioReader(geographic), scratch)
+    return _windowed(OiioReader(_located(picture, geographic)), scratch)
+
+
+def _check_readable(path: Path) -> None:
+    if not path.exists():
+        raise InputError(f"{path}: no such file")
+    if not path.is_file():
+        raise InputError(f"{path}: not a file; give one image or elevation file")
+    try:
+        with path.open("rb") as file:
+            if not file.read(1):
+                raise InputError(f"{path}: the file is empty")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def _located(picture: FileInfo, geographic: FileInfo) -> FileInfo:
+    """Add what only GDAL reads from the header: nodata, georeference, and an alpha channel OpenImageIO does not name."""
+    alpha = geographic.alpha if picture.alpha is None and geographic.channels == picture.channels else picture.alpha
+    return replace(picture, nodata=geographic.nodata, georeference=geographic.georeference, alpha=alpha)
+
+
+def _windowed(reader: Reader, scratch: Path) -> Reader:
+    return SpooledReader(reader, scratch) if reader.info.layout == "sequential" else reader
+
+
+def _check_declared_size(info: FileInfo) -> None:
+    declared = info.width * info.height * info.channels * info.dtype.itemsize
+    if info.format.lower() in _BOUNDED_EXPANSION and declared > _MAX_EXPANSION * info.file_bytes:
+        raise InputError(
+            f"{info.path}: declares {info.width} x {info.height} x {info.channels} samples ({declared / 1e9:.1f} GB) "
+            f"in {info.file_bytes} bytes; the file is damaged or malicious"
+        )

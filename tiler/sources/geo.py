@@ -1,0 +1,116 @@
+"""What rasterio knows: georeference, nodata and masks of every file GDAL understands, and pixels where OpenImageIO has no reader."""
+
+import logging
+import threading
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from rasterio.enums import ColorInterp, MaskFlags
+from rasterio.errors import NotGeoreferencedWarning, RasterioError, RasterioIOError
+from rasterio.windows import Window
+
+from schemas.errors import InputError
+from schemas.region import Rect
+from tiler.sources import FileInfo, Georeference, Layout, Pixels
+
+_UNITS = {"metre": "metre", "meter": "metre", "m": "metre", "foot": "foot", "us survey foot": "us-foot"}
+_WHOLE_IMAGE_DRIVERS = {"PNG", "JPEG", "GIF", "BMP", "WEBP"}
+"""Drivers whose files can only be decoded from top to bottom."""
+
+
+def _open(path: Path) -> Any:  # noqa: ANN401 - rasterio has no types
+    # Without a handler Python prints GDAL's own messages to stderr; ours say the same in one sentence.
+    logging.getLogger("rasterio").addHandler(logging.NullHandler())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        return rasterio.open(path)
+
+
+def describe(path: Path) -> FileInfo | None:
+    """Return what rasterio reads from the header of ``path``, None if no driver of GDAL knows the file."""
+    try:
+        with _open(path) as dataset:
+            return _info(path, dataset)
+    except RasterioIOError:
+        return None
+
+
+def _info(path: Path, dataset: Any) -> FileInfo | None:  # noqa: ANN401
+    if dataset.count == 0:
+        return None
+    if len(set(dataset.dtypes)) > 1:
+        raise InputError(f"{path}: channels of different types ({', '.join(dataset.dtypes)}); choose with gdal_translate -b")
+    flags = dataset.mask_flag_enums[0]
+    block_rows, block_columns = dataset.block_shapes[0]
+    alphas = [channel for channel, meaning in enumerate(dataset.colorinterp) if meaning == ColorInterp.alpha]
+    layout: Layout = "tiled" if block_columns < dataset.width or block_rows >= dataset.height else "striped"
+    return FileInfo(
+        path=path,
+        format=str(dataset.driver),
+        width=int(dataset.width),
+        height=int(dataset.height),
+        channels=int(dataset.count),
+        dtype=np.dtype(dataset.dtypes[0]),
+        file_bytes=path.stat().st_size,
+        layout="sequential" if dataset.driver in _WHOLE_IMAGE_DRIVERS else layout,
+        chunk_rows=int(block_rows),
+        alpha=alphas[0] if alphas else None,
+        nodata=None if dataset.nodata is None else float(dataset.nodata),
+        has_mask=MaskFlags.per_dataset in flags and MaskFlags.alpha not in flags,
+        georeference=_georeference(dataset),
+    )
+
+
+def _georeference(dataset: Any) -> Georeference | None:  # noqa: ANN401
+    transform = dataset.transform
+    if dataset.crs is None and transform.is_identity:
+        return None
+    crs, unit = dataset.crs, "unknown"
+    name = None
+    if crs is not None:
+        authority = crs.to_authority()
+        name = ":".join(authority) if authority else crs.to_wkt()
+        unit = "degree" if crs.is_geographic else _UNITS.get(str(crs.linear_units).lower(), "unknown")
+    a, b, c, d, e, f = (float(value) for value in tuple(transform)[:6])
+    if not np.isfinite([a, b, c, d, e, f]).all() or a * e - b * d == 0:
+        raise InputError(f"{dataset.name}: the georeference is degenerate (a pixel has no area); repair it with gdal_edit.py -a_ullr")
+    return Georeference(name, unit, (a, b, c, d, e, f))  # type: ignore[arg-type]  # unit is one of the literals by construction
+
+
+class RasterioReader:
+    """Windows through rasterio, one handle per thread (GDAL handles must not be shared)."""
+
+    def __init__(self, info: FileInfo) -> None:
+        self.info = info
+        self._local = threading.local()
+        self._handles: list[Any] = []
+        self._lock = threading.Lock()
+
+    def _handle(self) -> Any:  # noqa: ANN401
+        handle = getattr(self._local, "handle", None)
+        if handle is None:
+            handle = self._local.handle = _open(self.info.path)
+            with self._lock:
+                self._handles.append(handle)
+        return handle
+
+    def read(self, window: Rect) -> tuple[Pixels, NDArray[np.uint8] | None]:
+        """Return pixels (rows, columns, channels) and mask or None; raises InputError if the file cannot be read."""
+        area = Window(window.x0, window.y0, window.width, window.height)
+        try:
+            handle = self._handle()
+            pixels = np.moveaxis(handle.read(window=area), 0, -1)
+            mask = handle.dataset_mask(window=area) if self.info.has_mask else None
+        except (RasterioError, MemoryError) as error:
+            raise InputError(f"{self.info.path}: cannot be read at rows {window.y0} to {window.y1}: {error}") from error
+        return pixels, mask
+
+    def close(self) -> None:
+        """Close the handles of all threads."""
+        with self._lock:
+            while self._handles:
+                self._handles.pop().close()
