@@ -169,7 +169,11 @@ def _floats(values: NDArray[np.generic]) -> tuple[float, ...]:
 
 
 def _padded(samples: Samples, mask: Mask | None, block: BlockFormat) -> tuple[Samples, Mask | None]:
-    """Fill a block that overhangs its level by repeating the edge, transparent if there is alpha: never black."""
+    """Fill a block that overhangs its level by repeating the edge, never black; transparent if there is alpha, void for heights.
+
+    Void padding is what a client must see (there is no ground), and it costs nothing: coded as ground, the repeated last row of a
+    1025 x 1025 terrain takes as many bytes as a full block.
+    """
     rows, columns = samples.shape[:2]
     if (rows, columns) == (block.side, block.side):
         return samples, mask
@@ -178,4 +182,6 @@ def _padded(samples: Samples, mask: Mask | None, block: BlockFormat) -> tuple[Sa
     if block.alpha:
         padded[rows:, :, -1] = 0
         padded[:, columns:, -1] = 0
-    return padded, None if mask is None else np.pad(mask, missing, mode="edge")
+    if block.kind == "height":
+        mask = np.pad(np.ones((rows, columns), np.bool_) if mask is None else mask, missing)
+    return padded, mask

@@ -156,6 +156,8 @@ def _guessed_kind(info: FileInfo, colours: tuple[int, ...]) -> LayerKind:
         return "height"
     if len(colours) == 3 and info.dtype.kind == "u":
         return "imagery"
+    if len(colours) not in (1, 3):
+        raise UsageError(f"{info.path}: has {len(colours)} channels; choose 1 or 3 with --bands, e.g. --bands 1,2,3")
     raise UsageError(
         f"{info.path}: {len(colours)} channel(s) of {info.dtype} could be imagery or heights; say --layer imagery or --layer height"
     )
