@@ -33,6 +33,8 @@ Progress = Callable[[int, int], None]
 
 _PORTION_ROWS: Final = 256
 _MAX_PORTION_ROWS: Final = 1024
+_PUSHED_ROWS: Final = 64
+"""Rows filtered at once: few enough for their levels to stay in the second-level cache, and for little memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +75,17 @@ def build_layer(path: Path, output: Path, settings: BuildSettings, on_progress: 
         times=times,
         wall_s=perf_counter() - started,
         megasamples=plan.lattice.width * plan.lattice.height / 1e6,
-        peak_rss_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        peak_rss_bytes=_peak_rss_bytes(),
     )
+
+
+def _peak_rss_bytes() -> int:
+    """Return the largest resident set this process has had; ``getrusage`` would count a parent's, inherited by fork."""
+    with suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
 def _refuse_foreign(output: Path) -> None:
@@ -183,7 +194,9 @@ class _TaskRunner:
             before_read = perf_counter()
             values, coverage = self._samples.read(Rect(whole.x0, y, whole.x1, end))
             times.read_s += perf_counter() - before_read
-            cascade.push(values, coverage)
+            for row in range(0, end - y, _PUSHED_ROWS):
+                rows = slice(row, row + _PUSHED_ROWS)
+                cascade.push(values[rows], None if coverage is None else coverage[rows])
             y = end
         times.filter_s = perf_counter() - started - times.read_s - times.encode_s - times.write_s
         return times

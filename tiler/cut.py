@@ -15,6 +15,7 @@ from schemas.manifest import block_key, digest
 from schemas.region import Rect
 from tiler.cascade import Coverage, Values
 from tiler.codecs import BlockFormat, Codec, Mask, Samples
+from tiler.measure import measure
 from tiler.stores import Store
 
 
@@ -135,21 +136,18 @@ class Cutter:
 
     def _finish(self, address: BlockAddress, samples: Samples, mask: Mask | None) -> CutBlock:
         target = self._target
-        colours = samples[..., :-1] if target.block.alpha else samples
         valid = samples[..., -1] > 0 if target.block.alpha else mask
-        seen = colours.reshape(-1, colours.shape[-1]) if valid is None else colours[valid]
-        if not len(seen):
+        count, (minima, maxima, sums) = measure(samples, valid, samples.shape[-1] - target.block.alpha)
+        if not count:
             return CutBlock(address, BLANK, (), (), ())
-        minima, maxima = seen.min(axis=0), seen.max(axis=0)
+        low, high = float(minima.min()), float(maxima.max())
         started = perf_counter()
-        samples = self._within_range(address, samples, float(minima.min()), float(maxima.max()))
-        data = target.codec.encode(*_padded(samples, mask, target.block))
+        data = target.codec.encode(*_padded(self._within_range(address, samples, low, high), mask, target.block))
         encoded = perf_counter()
         target.store.write(target.key(address), data)
         self.times.encode_s += encoded - started
         self.times.write_s += perf_counter() - encoded
-        record = BlockRecord(digest(data), len(data), len(seen), float(minima.min()), float(maxima.max()))
-        return CutBlock(address, record, _floats(minima), _floats(maxima), _floats(seen.sum(axis=0, dtype=np.float64)))
+        return CutBlock(address, BlockRecord(digest(data), len(data), count, low, high), _floats(minima), _floats(maxima), _floats(sums))
 
     def _within_range(self, address: BlockAddress, samples: Samples, low: float, high: float) -> Samples:
         """Refuse source values the codec cannot hold; clip what the filter overshot on coarser levels."""

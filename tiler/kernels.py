@@ -1,10 +1,10 @@
 """Filter design: the taps of one-dimensional low-pass kernels for halving a level, and their frequency response.
 
 A kernel is designed as a windowed sinc of cut-off half the coarse sampling rate, in float64, and then quantised to
-multiples of 2**-25, the grid on which sums of float32 weights are exact. So the weights used by the float32 loops sum
-to exactly 1, and a ``point`` kernel is exactly half-band: centre 1/2, odd taps summing to 1/2, even taps 0, hence a
-response of exactly 0 at the Nyquist frequency. The quantisation changes no weight by more than 1.5e-8 (one tap takes
-the rest of the sum: at most 1e-7 at radius 16).
+multiples of 2**-23, the grid on which float32 adds numbers below 2 exactly. So the weights used by the float32 loops sum
+to exactly 1 in any order, and a ``point`` kernel is exactly half-band: centre 1/2, odd taps summing to 1/2, even taps 0, hence a
+response of exactly 0 at the Nyquist frequency. The quantisation changes no weight by more than 6e-8, except the
+innermost, which takes the rest of the sum: at most 2.7e-7 up to radius 16.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from schemas.errors import UsageError
 from schemas.lattice import Registration
 
-_GRID: Final = 2.0**25
+_GRID: Final = 2.0**23
 MAX_RADIUS: Final = 16
 
 

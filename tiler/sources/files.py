@@ -3,6 +3,8 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from schemas.errors import InputError
 from tiler.sources import FileInfo, Reader, geo, oiio
 from tiler.sources.geo import RasterioReader
@@ -41,7 +43,8 @@ def open_file(path: Path, scratch: Path) -> Reader:
     _check_declared_size(picture)
     if geographic is None:
         return _windowed(OiioReader(picture), scratch)
-    if (geographic.width, geographic.height) != (picture.width, picture.height):
+    if picture.dtype == np.float64 or (geographic.width, geographic.height) != (picture.width, picture.height):
+        # OpenImageIO 3.2 returns uninitialised memory for tiled float64 TIFF, without an error.
         return _windowed(RasterioReader(geographic), scratch)
     return _windowed(OiioReader(_located(picture, geographic)), scratch)
 

@@ -13,6 +13,8 @@ from tiler.sources import FileInfo, Layout, Pixels
 
 _RANDOM_ACCESS = {"tiff", "openexr"}
 _PREMULTIPLIED_BY_DEFAULT = {"tiff", "openexr"}
+_DTYPES = {"half": "float16", "float": "float32", "double": "float64", "int": "int32", "uint": "uint32"}
+"""OpenImageIO's names of sample types where NumPy has others."""
 _STRIP_LIMIT_BYTES = 64 << 20
 """A strip larger than this is decoded once, from top to bottom, instead of again for each window."""
 
@@ -39,7 +41,7 @@ def describe(path: Path) -> FileInfo:
     spec = handle.spec()
     name = str(handle.format_name())
     handle.close()
-    dtype = np.dtype({"half": "float16", "float": "float32", "double": "float64"}.get(str(spec.format), str(spec.format)))
+    dtype = np.dtype(_DTYPES.get(str(spec.format), str(spec.format)))
     if spec.depth > 1 or spec.deep:
         raise InputError(f"{path}: volumes and deep images are not pictures of terrain")
     if spec.get_int_attribute("Orientation", 1) != 1:
