@@ -106,14 +106,15 @@ class Lattice:
         """Position of a block in the row order of its level."""
         return address.y * self.block_counts(address.level)[0] + address.x
 
-    def support(self, coarse: Rect, reach: tuple[int, int]) -> Rect:
-        """The samples of the finer level under ``coarse`` samples whose filter reaches ``reach`` = (before, after) fine sample 2i.
-
-        The rectangle is not clipped to the level: what lies outside it is made by the edge rule.
-        """
-        before, after = reach
-        return Rect(2 * coarse.x0 - before, 2 * coarse.y0 - before, 2 * (coarse.x1 - 1) + after + 1, 2 * (coarse.y1 - 1) + after + 1)
-
     def _check_level(self, level: int) -> None:
         if not 0 <= level < self.levels:
             raise NotFoundError(f"level {level} does not exist: levels run from 0 to {self.levels - 1}")
+
+
+def support(coarse: Rect, reach: tuple[int, int]) -> Rect:
+    """Return the samples of the finer level under ``coarse`` samples whose filter reaches ``reach`` = (before, after) fine sample 2i.
+
+    The rectangle is not clipped to the level: what lies outside it is made by the edge rule.
+    """
+    before, after = reach
+    return Rect(2 * coarse.x0 - before, 2 * coarse.y0 - before, 2 * (coarse.x1 - 1) + after + 1, 2 * (coarse.y1 - 1) + after + 1)

@@ -26,6 +26,7 @@ Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
 Transform = tuple[float, float, float, float, float, float]
 SampleType = Literal["uint8", "uint16", "float32"]
 LayerKind = Literal["imagery", "height"]
+KernelName = Literal["blackman-sinc", "kaiser", "lanczos", "triangle", "box"]
 
 
 class Model(BaseModel):
@@ -66,7 +67,7 @@ class Source(Model):
 class Filter(Model):
     """How coarser levels are made."""
 
-    kernel: Literal["blackman-sinc"] = Field(description="Kernel, one dimension of a separable filter")
+    kernel: KernelName = Field(description="Kernel, one dimension of a separable filter")
     radius: int = Field(ge=1, description="Kernel radius [coarse samples]")
     edge: Literal["antisymmetric", "mirror"] = Field(description="What a filter sees beyond the source's edge")
     void: Literal["guarded-normalised"] = Field(

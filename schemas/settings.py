@@ -5,9 +5,8 @@ from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from schemas.manifest import LayerKind
+from schemas.manifest import KernelName, LayerKind
 
-Kernel = Literal["blackman-sinc"]
 HeightEncoding = Literal["terrarium", "terrain-rgb"]
 
 
@@ -23,8 +22,10 @@ class BuildSettings(Settings):
     layer: LayerKind | None = Field(default=None, description="Kind of the layer; guessed from the source where safe")
     block: int = Field(default=256, description="Side of a block's core [samples], a power of two")
     codec: str | None = Field(default=None, description="Block codec, e.g. jpeg:85, png, webp:90, lerc:0.01")
-    filter: Kernel = Field(default="blackman-sinc", description="Kernel that makes coarser levels")
-    radius: int | None = Field(default=None, ge=1, le=16, description="Kernel radius [coarse samples]; 6 for heights, 3 for imagery")
+    filter: KernelName = Field(default="blackman-sinc", description="Kernel that makes coarser levels")
+    radius: int | None = Field(
+        default=None, ge=1, le=16, description="Kernel radius [coarse samples]; 6 for heights, 3 for imagery, 1 for box and triangle"
+    )
     task: int = Field(default=2048, ge=2, description="Side of a task [level-0 samples]; has no effect on the result")
     workers: int | None = Field(
         default=None, ge=1, le=256, description="Threads; default: the processors there are; has no effect on the result"

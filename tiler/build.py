@@ -113,9 +113,11 @@ def _build(
 
 
 def _unused_path(name: str, dataset: Manifest | None) -> str:
-    """Return a prefix no published layer uses, so that a rebuild leaves the old blocks alone until it is done."""
-    used = set() if dataset is None else {layer.path for layer in dataset.layers.values()}
-    return next(path for path in (name, f"{name}.2") if path not in used)
+    """Return a prefix that no version so far had: a reader of an old manifest finds old blocks or none, never new ones."""
+    if dataset is None or name not in dataset.layers:
+        return name
+    _, _, count = dataset.layers[name].path.partition(".")
+    return f"{name}.{int(count or 1) + 1}"
 
 
 class _Carried:
@@ -234,7 +236,7 @@ def _layer_entry(plan: Plan, target: Target, ledger: Ledger) -> Layer:
         max_error=plan.codec.max_error,
         transform=plan.placement.transform,
         ground_spacing_m=plan.placement.ground_spacing_m,
-        filter=Filter(kernel="blackman-sinc", radius=kernel.radius, edge=plan.recipe.edge),
+        filter=Filter(kernel=kernel.name, radius=kernel.radius, edge=plan.recipe.edge),
         source=_source_entry(plan),
         statistics=ledger.statistics(),
         levels=[ledger.level(level) for level in range(plan.lattice.levels)],

@@ -12,6 +12,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.lattice import support
 from schemas.region import Rect
 from tiler.decimate import coarsen_columns, coarsen_partial, coarsen_rows, flag_partial
 from tiler.edges import EdgeRule, extend
@@ -42,10 +43,7 @@ def held_windows(size: tuple[int, int], core: Rect, levels: int, reach: tuple[in
         whole = Rect(0, 0, *sizes[level])
         own = Rect(core.x0 >> level, core.y0 >> level, -(-core.x1 >> level), -(-core.y1 >> level)) & whole
         if windows:
-            coarse = windows[-1]
-            before, after = reach
-            support = Rect(2 * coarse.x0 - before, 2 * coarse.y0 - before, 2 * (coarse.x1 - 1) + after + 1, 2 * (coarse.y1 - 1) + after + 1)
-            seen = support & whole
+            seen = support(windows[-1], reach) & whole
             own = Rect(min(own.x0, seen.x0), min(own.y0, seen.y0), max(own.x1, seen.x1), max(own.y1, seen.y1))
         windows.append(own)
     return windows[::-1]

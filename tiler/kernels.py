@@ -1,13 +1,14 @@
 """Filter design: the taps of one-dimensional low-pass kernels for halving a level, and their frequency response.
 
-A kernel is designed as a windowed sinc of cut-off half the coarse sampling rate, in float64, and then quantised to
+A windowed sinc is designed for a cut-off of half the coarse sampling rate, in float64, and then quantised to
 multiples of 2**-23, the grid on which float32 adds numbers below 2 exactly. So the weights used by the float32 loops sum
 to exactly 1 in any order, and a ``point`` kernel is exactly half-band: centre 1/2, odd taps summing to 1/2, even taps 0, hence a
 response of exactly 0 at the Nyquist frequency. The quantisation changes no weight by more than 6e-8, except the
 innermost, which takes the rest of the sum: at most 2.7e-7 up to radius 16.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from schemas.errors import UsageError
 from schemas.lattice import Registration
+from schemas.manifest import KernelName
 
 _GRID: Final = 2.0**23
 MAX_RADIUS: Final = 16
@@ -28,7 +30,7 @@ class Kernel:
     ``area`` the centre lies between offsets 0 and 1, for ``point`` on offset 0, whose weight is what the pairs leave of 1.
     """
 
-    name: str
+    name: KernelName
     radius: int
     registration: Registration
     low: tuple[int, ...]
@@ -49,24 +51,75 @@ class Kernel:
         return np.array(offsets, np.int64), np.array([weight[offset] for offset in offsets])
 
 
-def blackman_sinc(radius: int, registration: Registration) -> Kernel:
-    """Return the sinc with a Blackman window of ``radius`` coarse samples.
+Window = Callable[[NDArray[np.float64], int], NDArray[np.float64]]
+"""Gives the window at ``t`` = distance / radius, |t| < 1, for a radius in coarse samples."""
 
-    Window 0.42 + 0.5 cos(pi t) + 0.08 cos(2 pi t) over |t| < 1, as Holkner's "Hardware Based Clipmapping", section 3,
-    uses for terrain levels. Raises UsageError if the radius is not between 1 and 16.
-    """
+
+def _blackman(t: NDArray[np.float64], radius: int) -> NDArray[np.float64]:
+    return 0.42 + 0.5 * np.cos(np.pi * t) + 0.08 * np.cos(2 * np.pi * t)
+
+
+def _lanczos(t: NDArray[np.float64], radius: int) -> NDArray[np.float64]:
+    return np.sinc(t)
+
+
+def _kaiser(t: NDArray[np.float64], radius: int) -> NDArray[np.float64]:
+    beta = 4 * radius / 3
+    return np.i0(beta * np.sqrt(1 - t * t)) / np.i0(beta)
+
+
+def _windowed_sinc(name: KernelName, window: Window, radius: int, registration: Registration) -> Kernel:
     if not 1 <= radius <= MAX_RADIUS:
         raise UsageError(f"filter radius {radius}: must be between 1 and {MAX_RADIUS} coarse samples")
     odd = np.arange(1, 2 * radius, 2)
     distance = np.arange(2 * radius) + 0.5 if registration == "area" else odd.astype(np.float64)
-    t = distance / (2 * radius)
-    window = 0.42 + 0.5 * np.cos(np.pi * t) + 0.08 * np.cos(2 * np.pi * t)
-    ideal = np.sinc(distance / 2) * window
+    ideal = np.sinc(distance / 2) * window(distance / (2 * radius), radius)
     total = 0.5 if registration == "area" else 0.25
     weights = _quantised(ideal * (total / ideal.sum()), total)
     low = -np.arange(2 * radius) if registration == "area" else -odd
     high = np.arange(2 * radius) + 1 if registration == "area" else odd
-    return Kernel("blackman-sinc", radius, registration, _ints(low), _ints(high), weights)
+    return Kernel(name, radius, registration, _ints(low), _ints(high), weights)
+
+
+def blackman_sinc(radius: int, registration: Registration) -> Kernel:
+    """Return the sinc with a Blackman window of ``radius`` coarse samples, the default.
+
+    Window 0.42 + 0.5 cos(pi t) + 0.08 cos(2 pi t) over |t| < 1, as Holkner's "Hardware Based Clipmapping", section 3,
+    uses for terrain levels. Raises UsageError if the radius is not between 1 and 16.
+    """
+    return _windowed_sinc("blackman-sinc", _blackman, radius, registration)
+
+
+def lanczos(radius: int, registration: Registration) -> Kernel:
+    """Return the sinc with the main lobe of a wider sinc as its window (Lanczos; Duchon 1979), ``radius`` coarse samples."""
+    return _windowed_sinc("lanczos", _lanczos, radius, registration)
+
+
+def kaiser(radius: int, registration: Registration) -> Kernel:
+    """Return the sinc with a Kaiser window of beta = 4/3 radius, i.e. 4 at radius 3 and 8 at radius 6 (Kaiser 1974).
+
+    At equal taps it droops and aliases less than Blackman's, and overshoots more (at radius 3: 5.2 % of a step against 3.4 %).
+    """
+    return _windowed_sinc("kaiser", _kaiser, radius, registration)
+
+
+def box(radius: int, registration: Registration) -> Kernel:
+    """Return the mean over one coarse cell: 2 cells (``area``), or (1, 2, 1) / 4 (``point``). ``radius`` must be 1."""
+    _check_radius_one("box", radius)
+    return covering(registration)
+
+
+def triangle(radius: int, registration: Registration) -> Kernel:
+    """Return linear interpolation's adjoint: (1, 3, 3, 1) / 8 (``area``), or (1, 2, 1) / 4 (``point``). ``radius`` must be 1."""
+    _check_radius_one("triangle", radius)
+    if registration == "area":
+        return Kernel("triangle", 1, "area", (0, -1), (1, 2), (0.375, 0.125))
+    return replace(covering("point"), name="triangle")
+
+
+def _check_radius_one(name: str, radius: int) -> None:
+    if radius != 1:
+        raise UsageError(f"filter {name} has a fixed support of one coarse sample; leave out --radius, or give 1")
 
 
 def covering(registration: Registration) -> Kernel:
@@ -75,11 +128,19 @@ def covering(registration: Registration) -> Kernel:
     It carries coverage from level to level, and is the fallback where voids leave a windowed sinc too little weight.
     """
     if registration == "area":
-        return Kernel("covering", 1, "area", (0,), (1,), (0.5,))
-    return Kernel("covering", 1, "point", (-1,), (1,), (0.25,))
+        return Kernel("box", 1, "area", (0,), (1,), (0.5,))
+    return Kernel("box", 1, "point", (-1,), (1,), (0.25,))
 
 
-DESIGNS: Final = {"blackman-sinc": blackman_sinc}
+DESIGNS: Final[dict[KernelName, Callable[[int, Registration], Kernel]]] = {
+    "blackman-sinc": blackman_sinc,
+    "kaiser": kaiser,
+    "lanczos": lanczos,
+    "triangle": triangle,
+    "box": box,
+}
+FIXED_RADIUS: Final[frozenset[KernelName]] = frozenset({"triangle", "box"})
+"""Kernels whose radius is 1 and cannot be chosen."""
 
 
 def frequency_response(kernel: Kernel, frequency: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from schemas.settings import BuildSettings
 from tiler.cascade import Recipe
 from tiler.codecs import BlockFormat, Codec, open_codec
 from tiler.edges import EdgeRule
-from tiler.kernels import DESIGNS
+from tiler.kernels import DESIGNS, FIXED_RADIUS
 from tiler.placement import Placement, place
 from tiler.sources.convert import Source
 from tiler.tasks import Tier, plan_tiers
@@ -74,7 +74,8 @@ def plan_layer(source: Source, dataset: Manifest | None, settings: BuildSettings
         dtype="float32" if conversion.kind == "height" else "uint8" if info.dtype == np.uint8 else "uint16",
         alpha=alpha,
     )
-    kernel = DESIGNS[settings.filter](settings.radius or defaults.radius, defaults.registration)
+    radius = settings.radius or (1 if settings.filter in FIXED_RADIUS else defaults.radius)
+    kernel = DESIGNS[settings.filter](radius, defaults.registration)
     return Plan(
         source=source,
         name=name,

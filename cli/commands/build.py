@@ -3,13 +3,14 @@
 import sys
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import click
 from pydantic import ValidationError
 
 from cli.output import emit_json, emit_pairs, format_bytes
 from schemas.errors import UsageError
+from schemas.manifest import KernelName
 from schemas.settings import BuildSettings
 
 
@@ -40,7 +41,11 @@ def _settings(options: dict[str, Any]) -> BuildSettings:
 )
 @click.option("--block", type=int, default=256, show_default=True, help="Side of a block in samples, a power of two.")
 @click.option(
-    "--filter", type=click.Choice(["blackman-sinc"]), default="blackman-sinc", show_default=True, help="Kernel that makes coarser levels."
+    "--filter",
+    type=click.Choice(get_args(KernelName)),
+    default="blackman-sinc",
+    show_default=True,
+    help="Kernel that makes coarser levels.",
 )
 @click.option("--radius", type=int, help="Kernel radius in coarse samples.  [default: 6 for heights, 3 for imagery]")
 @click.option("--spacing", type=float, help="Metres between samples, for a source without georeference.")

@@ -10,13 +10,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from schemas.lattice import Registration
+from schemas.manifest import KernelName
 from schemas.region import Rect
 from tests.reference import kernels as reference_kernels
 from tests.reference import pyramid as reference
 from tests.reference.terrain import photo, terrain
 from tiler.cascade import Cascade, Coverage, Recipe, Values, held_windows
 from tiler.edges import EdgeRule
-from tiler.kernels import blackman_sinc, covering, frequency_response
+from tiler.kernels import DESIGNS, FIXED_RADIUS, blackman_sinc, covering, frequency_response
 
 LevelRows = tuple[Rect, Values, Coverage | None]
 HEIGHT: tuple[Registration, EdgeRule] = ("point", "antisymmetric")
@@ -98,6 +99,18 @@ def test_kernel_agrees_with_the_reference_design(radius: int, registration: Regi
 def test_published_taps() -> None:
     """The r = 3 half-band as computed independently when clipmap was designed: 1/2, .2843711, -.0360899, .0017188."""
     assert blackman_sinc(3, "point").weights == pytest.approx((0.2843711, -0.0360899, 0.0017188), abs=5e-8)
+
+
+@pytest.mark.parametrize(("name", "registration"), list(product(DESIGNS, ("area", "point"))))
+def test_every_design_agrees_with_its_reference(name: KernelName, registration: Registration) -> None:
+    radius = 1 if name in FIXED_RADIUS else 4
+    reference_name = f"kaiser:{4 * radius / 3}" if name == "kaiser" else name
+    offsets, weights = DESIGNS[name](radius, registration).taps()
+    expected_offsets, expected = reference_kernels.taps(reference_name, radius, registration)
+    by_offset = {offset: weight for offset, weight in zip(expected_offsets.tolist(), expected.tolist(), strict=True) if weight}
+    assert set(by_offset) == set(offsets.tolist())
+    assert max(abs(by_offset[offset] - weight) for offset, weight in zip(offsets.tolist(), weights, strict=True)) < 1e-6
+    assert weights.sum() == 1
 
 
 @pytest.mark.parametrize("kind", KINDS)

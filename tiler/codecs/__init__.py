@@ -56,7 +56,10 @@ class Codec(Protocol):
 
     @property
     def max_error(self) -> float | None:
-        """Largest absolute difference between a decoded and an encoded sample; 0 for lossless, None if not bounded."""
+        """Largest absolute difference between a decoded and an encoded sample; 0 for lossless, None if not bounded.
+
+        Rounding to the block's dtype may come on top: half a unit in the last place of a float32.
+        """
         ...
 
     @property
@@ -94,6 +97,29 @@ def checked(samples: Samples, block: BlockFormat, spec: str) -> Samples:
     if samples.shape != expected or samples.dtype != block.dtype:
         raise InputError(f"a {spec} block holds {samples.shape} {samples.dtype} instead of {expected} {block.dtype}; it is damaged")
     return samples
+
+
+def voids_zeroed(samples: Samples, mask: Mask | None) -> tuple[Samples, Mask | None]:
+    """Return ``samples`` (side, side, channels) with 0 where ``mask`` is False, and the mask, None if all samples are valid."""
+    if mask is None or mask.all():
+        return samples, None
+    return np.where(mask[..., np.newaxis], samples, samples.dtype.type(0)), mask
+
+
+def require_picture_end(data: bytes, end: bytes, what: str) -> None:
+    """Raise ValueError if ``data`` does not end in ``end``: libraries forgive a cut that spares the last pixels, or fill up with grey."""
+    if not data.endswith(end):
+        raise ValueError(f"the {what} is missing")
+
+
+PNG_END: Final = b"\x00\x00\x00\x00IEND\xaeB`\x82"
+"""The last chunk of every PNG, with its length and check sum."""
+
+
+def number_text(value: float) -> str:
+    """Return the shortest text of a parameter that reads back as the same number, so that a stored codec string loses nothing."""
+    text = f"{value:g}"
+    return text if float(text) == value else repr(value)
 
 
 Factory = Callable[[BlockFormat, str], Codec]

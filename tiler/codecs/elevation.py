@@ -1,20 +1,36 @@
 """Codecs for heights in metres with voids: ``lerc:E`` (bounded error) and ``png16:SCALE,OFFSET`` (16-bit integers)."""
 
 from dataclasses import dataclass
+from math import frexp, ldexp
 from typing import Final
 
 import imagecodecs
 import numpy as np
 
 from schemas.errors import InputError, UsageError
-from tiler.codecs import BlockFormat, Factory, Mask, Samples, checked, decoding
+from tiler.codecs import (
+    PNG_END,
+    BlockFormat,
+    Factory,
+    Mask,
+    Samples,
+    checked,
+    decoding,
+    number_text,
+    require_picture_end,
+    voids_zeroed,
+)
 
+_FLOAT32_BITS: Final = 24
 _PNG_LEVEL: Final = 6
+_PNG_COLOUR_TYPE: Final = 25
+"""Where the header of a PNG says which channels it has."""
+_PNG_GREY_ALPHA: Final = b"\x04"
 
 
 @dataclass(frozen=True, slots=True)
 class LercCodec:
-    """Limited error raster compression: every decoded height is within ``max_error`` metres, 0 means lossless."""
+    """Limited error raster compression: every decoded height is within ``max_error`` metres, 0 means lossless but for the sign of 0."""
 
     block: BlockFormat
     spec: str
@@ -25,10 +41,11 @@ class LercCodec:
 
     def encode(self, samples: Samples, mask: Mask | None) -> bytes:
         """Return the LERC2 blob of ``samples`` (side, side, 1) float32 and ``mask``."""
-        masks = None if mask is None or mask.all() else np.ascontiguousarray(mask)
+        samples, mask = voids_zeroed(samples, mask)
+        masks = None if mask is None else np.ascontiguousarray(mask)
         # LERC bounds the error before it rounds to float32: half a unit in the last place (0.5 mm at 8848 m) must fit in as well.
-        rounding = float(np.spacing(np.abs(samples).max(initial=0, where=np.isfinite(samples))))
-        bound = max(0.0, self.max_error - rounding)
+        _, exponent = frexp(float(np.abs(samples).max()))
+        bound = max(0.0, self.max_error - ldexp(1.0, exponent - _FLOAT32_BITS))
         return bytes(imagecodecs.lerc_encode(np.ascontiguousarray(samples[..., 0]), bound, masks=masks))
 
     def decode(self, data: bytes) -> tuple[Samples, Mask | None]:
@@ -37,10 +54,7 @@ class LercCodec:
             samples, mask = imagecodecs.lerc_decode(data, masks=True)
         samples = checked(np.asarray(samples)[..., np.newaxis], self.block, self.spec)
         valid = np.asarray(mask, np.bool_)
-        if valid.ndim == 0 or valid.all():
-            return samples, None
-        samples[~valid] = 0
-        return samples, valid
+        return voids_zeroed(samples, None if valid.ndim == 0 else valid)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +70,7 @@ class Png16Codec:
     @property
     def spec(self) -> str:
         """``png16:SCALE,OFFSET`` in metres."""
-        return f"png16:{self.scale_m:g},{self.offset_m:.9g}"
+        return f"png16:{number_text(self.scale_m)},{number_text(self.offset_m)}"
 
     @property
     def max_error(self) -> float:
@@ -70,30 +84,28 @@ class Png16Codec:
 
     def encode(self, samples: Samples, mask: Mask | None) -> bytes:
         """Return the PNG of ``samples`` (side, side, 1) float32; raises InputError if a valid height is out of range."""
-        heights = samples[..., 0].astype(np.float64)
-        steps = np.rint((heights - self.offset_m) / self.scale_m)
+        heights, mask = samples[..., 0].astype(np.float64), None if mask is None or mask.all() else mask
         if mask is not None:
-            steps = np.where(mask, steps, 0)
+            heights[~mask] = self.offset_m
+        steps = np.rint((heights - self.offset_m) / self.scale_m)
         if steps.min() < 0 or steps.max() > 65535:
             low, high = self.value_range
             raise InputError(f"codec {self.spec} holds heights from {low:g} to {high:g} m only; use another scale and offset, or lerc")
         grey = steps.astype(np.uint16)
-        if mask is not None and not mask.all():
+        if mask is not None:
             grey = np.stack([grey, np.where(mask, np.uint16(65535), np.uint16(0))], axis=-1)
         return bytes(imagecodecs.png_encode(grey, level=_PNG_LEVEL))
 
     def decode(self, data: bytes) -> tuple[Samples, Mask | None]:
         """Return (side, side, 1) float32 metres and mask; raises InputError if ``data`` is damaged."""
+        masked = data[_PNG_COLOUR_TYPE : _PNG_COLOUR_TYPE + 1] == _PNG_GREY_ALPHA
+        grey = np.empty((self.block.side, self.block.side, 2) if masked else (self.block.side, self.block.side), np.uint16)
         with decoding(self.spec):
-            grey = np.asarray(imagecodecs.png_decode(data))
-            if grey.dtype != np.uint16:
-                raise ValueError(f"{grey.dtype} samples instead of uint16")
-        mask = grey[..., 1] > 0 if grey.ndim == 3 else None
-        steps = grey[..., 0] if grey.ndim == 3 else grey
+            require_picture_end(data, PNG_END, "end chunk")
+            imagecodecs.png_decode(data, out=grey)
+        steps = grey[..., 0] if masked else grey
         heights = (steps * self.scale_m + self.offset_m).astype(np.float32)[..., np.newaxis]
-        if mask is not None:
-            heights[~mask] = 0
-        return checked(heights, self.block, self.spec), mask
+        return voids_zeroed(heights, grey[..., 1] > 0 if masked else None)
 
 
 def _require_heights(block: BlockFormat, name: str) -> None:
@@ -116,7 +128,7 @@ def _lerc(block: BlockFormat, parameters: str) -> LercCodec:
     max_error = _number(parameters or "0.01", "lerc", "the error bound")
     if max_error < 0:
         raise UsageError(f"codec lerc:{parameters}: the error bound must be 0 (lossless) or more metres")
-    return LercCodec(block, f"lerc:{max_error:g}", max_error)
+    return LercCodec(block, f"lerc:{number_text(max_error)}", max_error)
 
 
 def _png16(block: BlockFormat, parameters: str) -> Png16Codec:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import UsageError
-from tiler.codecs import BlockFormat, Factory, Mask, Samples, decoding
+from tiler.codecs import BlockFormat, Factory, Mask, Samples, decoding, voids_zeroed
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,21 +23,24 @@ class RawCodec:
 
     def encode(self, samples: Samples, mask: Mask | None) -> bytes:
         """Return the bytes of ``samples`` (side, side, channels) and, if any sample is void, of the packed ``mask``."""
+        if mask is not None and self.block.kind == "imagery":
+            raise UsageError("codec raw: the mask of imagery must be given as the alpha channel")
+        samples, mask = voids_zeroed(samples, mask)
         data = np.ascontiguousarray(samples).astype(self._dtype, copy=False).tobytes()
-        return data if mask is None or mask.all() else data + np.packbits(mask, bitorder="little").tobytes()
+        return data if mask is None else data + np.packbits(mask, bitorder="little").tobytes()
 
     def decode(self, data: bytes) -> tuple[Samples, Mask | None]:
         """Return samples (side, side, channels) and mask; raises InputError if ``data`` has a wrong length."""
         side, shape = self.block.side, (self.block.side, self.block.side, self.block.channels)
         plain = int(np.prod(shape)) * self._dtype.itemsize
         with decoding(self.spec):
-            if len(data) not in (plain, plain + -(-side * side // 8)):
+            if len(data) != plain and (self.block.kind == "imagery" or len(data) != plain + -(-side * side // 8)):
                 raise ValueError(f"{len(data)} bytes instead of {plain}")
             samples = np.frombuffer(data[:plain], self._dtype).reshape(shape).astype(self.block.dtype)
         if len(data) == plain:
             return samples, None
         bits = np.frombuffer(data[plain:], np.uint8)
-        return samples, np.unpackbits(bits, count=side * side, bitorder="little").reshape(side, side).astype(np.bool_)
+        return voids_zeroed(samples, np.unpackbits(bits, count=side * side, bitorder="little").reshape(side, side).astype(np.bool_))
 
     @property
     def _dtype(self) -> np.dtype[np.generic]:

@@ -47,6 +47,8 @@ class FileInfo:
     """Whether colour was multiplied by alpha before it was stored."""
     nodata: float | None = None
     has_mask: bool = False
+    compression: str | None = None
+    """How the pixels are compressed, as GDAL names it."""
     georeference: Georeference | None = None
 
     @property

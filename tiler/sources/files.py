@@ -8,6 +8,7 @@ import numpy as np
 from schemas.errors import InputError
 from tiler.sources import FileInfo, Reader, geo, oiio
 from tiler.sources.geo import RasterioReader
+from tiler.sources.masked import MaskedReader
 from tiler.sources.oiio import OiioReader
 from tiler.sources.spool import SpooledReader
 
@@ -16,6 +17,9 @@ _MAX_EXPANSION = 2000
 _BOUNDED_EXPANSION = {"png", "jpeg", "bmp", "gif", "pnm", "targa", "tga", "dpx", "cineon"}
 _BETTER_WITH_RASTERIO = {"jpeg2000", "JP2OpenJPEG", "JP2KAK", "JP2ECW"}
 """Formats that OpenImageIO decodes as a whole and GDAL by window."""
+_SHARED_COMPRESSIONS = {None, "LZW", "DEFLATE", "PACKBITS", "JPEG", "CCITTRLE", "CCITTFAX3", "CCITTFAX4"}
+"""Compressions of TIFF that OpenImageIO decodes as well as GDAL. It lacks the newer ones (ZSTD, LERC, ...), and leaves the missing
+parts of "YCbCr JPEG" black without an error."""
 _PICTURE_DRIVERS = {"PNG", "JPEG", "GIF", "BMP"}
 """GDAL drivers for formats of which OpenImageIO has the last word: it notices truncation."""
 
@@ -30,7 +34,7 @@ def open_file(path: Path, scratch: Path) -> Reader:
     geographic = geo.describe(path)
     if geographic is not None:
         _check_declared_size(geographic)
-        if geographic.has_mask or geographic.format in _BETTER_WITH_RASTERIO:
+        if geographic.format in _BETTER_WITH_RASTERIO:
             return RasterioReader(geographic)
     try:
         picture = oiio.describe(path)
@@ -43,29 +47,44 @@ def open_file(path: Path, scratch: Path) -> Reader:
     _check_declared_size(picture)
     if geographic is None:
         return _windowed(OiioReader(picture), scratch)
-    if picture.dtype == np.float64 or (geographic.width, geographic.height) != (picture.width, picture.height):
-        # OpenImageIO 3.2 returns uninitialised memory for tiled float64 TIFF, without an error.
-        return _windowed(RasterioReader(geographic), scratch)
-    return _windowed(OiioReader(_located(picture, geographic)), scratch)
+    if _only_gdal_decodes(geographic, picture):
+        return _windowed(RasterioReader(replace(geographic, premultiplied=picture.premultiplied)), scratch)
+    reader = _windowed(OiioReader(_located(picture, geographic)), scratch)
+    return MaskedReader(reader, RasterioReader(geographic)) if geographic.has_mask else reader
+
+
+def _only_gdal_decodes(geographic: FileInfo, picture: FileInfo) -> bool:
+    if (geographic.width, geographic.height) != (picture.width, picture.height):
+        return True
+    # OpenImageIO 3.2 returns uninitialised memory for tiled float64 TIFF, without an error.
+    return picture.format == "tiff" and (picture.dtype == np.float64 or geographic.compression not in _SHARED_COMPRESSIONS)
 
 
 def _check_readable(path: Path) -> None:
-    if not path.exists():
-        raise InputError(f"{path}: no such file")
-    if not path.is_file():
-        raise InputError(f"{path}: not a file; give one image or elevation file")
     try:
+        if path.is_dir():
+            raise InputError(f"{path}: is a folder; give one image or elevation file")
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: is no ordinary file; give one image or elevation file")
         with path.open("rb") as file:
             if not file.read(1):
                 raise InputError(f"{path}: the file is empty")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file") from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
 
 
 def _located(picture: FileInfo, geographic: FileInfo) -> FileInfo:
-    """Add what only GDAL reads from the header: nodata, georeference, and an alpha channel OpenImageIO does not name."""
-    alpha = geographic.alpha if picture.alpha is None and geographic.channels == picture.channels else picture.alpha
-    return replace(picture, nodata=geographic.nodata, georeference=geographic.georeference, alpha=alpha)
+    """Add what only GDAL reads from the header: nodata, mask, georeference, and an alpha channel OpenImageIO does not name.
+
+    Channels that differ in number are a palette, which OpenImageIO resolves: then GDAL's nodata value is an index, not a colour.
+    """
+    georeference = geographic.georeference
+    if geographic.channels != picture.channels:
+        return replace(picture, has_mask=geographic.has_mask, georeference=georeference)
+    alpha = geographic.alpha if picture.alpha is None else picture.alpha
+    return replace(picture, nodata=geographic.nodata, has_mask=geographic.has_mask, georeference=georeference, alpha=alpha)
 
 
 def _windowed(reader: Reader, scratch: Path) -> Reader:

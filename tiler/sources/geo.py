@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
+from rasterio._err import CPLE_BaseError
 from rasterio.enums import ColorInterp, MaskFlags
-from rasterio.errors import NotGeoreferencedWarning, RasterioError, RasterioIOError
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.windows import Window
 
 from schemas.errors import InputError
@@ -18,6 +19,8 @@ from schemas.region import Rect
 from tiler.sources import FileInfo, Georeference, Layout, Pixels
 
 _UNITS = {"metre": "metre", "meter": "metre", "m": "metre", "foot": "foot", "us survey foot": "us-foot"}
+_FAILURES = (RasterioError, CPLE_BaseError, MemoryError)
+"""What rasterio raises on damaged files; where it reads more than pixels, GDAL's own errors come through as they are."""
 _WHOLE_IMAGE_DRIVERS = {"PNG", "JPEG", "GIF", "BMP", "WEBP"}
 """Drivers whose files can only be decoded from top to bottom."""
 
@@ -31,11 +34,11 @@ def _open(path: Path) -> Any:  # noqa: ANN401 - rasterio has no types
 
 
 def describe(path: Path) -> FileInfo | None:
-    """Return what rasterio reads from the header of ``path``, None if no driver of GDAL knows the file."""
+    """Return what rasterio reads from the header of ``path``, None if no driver of GDAL can make sense of the file."""
     try:
         with _open(path) as dataset:
             return _info(path, dataset)
-    except RasterioIOError:
+    except _FAILURES:
         return None
 
 
@@ -46,6 +49,7 @@ def _info(path: Path, dataset: Any) -> FileInfo | None:  # noqa: ANN401
         raise InputError(f"{path}: channels of different types ({', '.join(dataset.dtypes)}); choose with gdal_translate -b")
     flags = dataset.mask_flag_enums[0]
     block_rows, block_columns = dataset.block_shapes[0]
+    structure = dataset.tags(ns="IMAGE_STRUCTURE")
     alphas = [channel for channel, meaning in enumerate(dataset.colorinterp) if meaning == ColorInterp.alpha]
     layout: Layout = "tiled" if block_columns < dataset.width or block_rows >= dataset.height else "striped"
     return FileInfo(
@@ -59,8 +63,10 @@ def _info(path: Path, dataset: Any) -> FileInfo | None:  # noqa: ANN401
         layout="sequential" if dataset.driver in _WHOLE_IMAGE_DRIVERS else layout,
         chunk_rows=int(block_rows),
         alpha=alphas[0] if alphas else None,
+        premultiplied=bool(alphas) and structure.get("ALPHA") == "PREMULTIPLIED",
         nodata=None if dataset.nodata is None else float(dataset.nodata),
         has_mask=MaskFlags.per_dataset in flags and MaskFlags.alpha not in flags,
+        compression=structure.get("COMPRESSION"),
         georeference=_georeference(dataset),
     )
 
@@ -105,9 +111,24 @@ class RasterioReader:
             handle = self._handle()
             pixels = np.moveaxis(handle.read(window=area), 0, -1)
             mask = handle.dataset_mask(window=area) if self.info.has_mask else None
-        except (RasterioError, MemoryError) as error:
-            raise InputError(f"{self.info.path}: cannot be read at rows {window.y0} to {window.y1}: {error}") from error
+        except _FAILURES as error:
+            raise self._unreadable(window, error) from error
         return pixels, mask
+
+    def read_mask(self, window: Rect) -> NDArray[np.uint8]:
+        """Return the file's mask (rows, columns), 0 void and 255 valid; raises InputError if it cannot be read."""
+        try:
+            mask: NDArray[np.uint8] = self._handle().dataset_mask(window=Window(window.x0, window.y0, window.width, window.height))
+        except _FAILURES as error:
+            raise self._unreadable(window, error) from error
+        return mask
+
+    def _unreadable(self, window: Rect, error: BaseException) -> InputError:
+        # rasterio says "Read failed. See previous exception for details."
+        reason = str(error.__cause__ or error).strip().splitlines()
+        return InputError(
+            f"{self.info.path}: cannot be read at rows {window.y0} to {window.y1}: {reason[0] if reason else 'no reason given'}"
+        )
 
     def close(self) -> None:
         """Close the handles of all threads."""

@@ -32,7 +32,7 @@ class DirectoryStore:
 
     def _path(self, key: str) -> Path:
         parts = key.split("/")
-        if not key or any(not part or part.startswith(".") for part in parts):
+        if "\0" in key or any(not part or part.startswith(".") for part in parts):
             raise NotFoundError(f"{self._root}: {key!r} is not a key of a store")
         return self._root.joinpath(*parts)
 
@@ -77,7 +77,7 @@ class DirectoryStore:
         self._known_folders.clear()
         try:
             shutil.rmtree(path)
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return
         except OSError as error:
             raise StorageError(f"{path}: cannot be deleted: {error.strerror}") from error
@@ -85,12 +85,11 @@ class DirectoryStore:
     def keys(self, prefix: str) -> list[str]:
         """Return the keys below ``prefix``, sorted; '' means all."""
         folder = self._path(prefix) if prefix else self._root
-        return sorted(
-            (Path(parent) / name).relative_to(self._root).as_posix()
-            for parent, _, names in os.walk(folder)
-            for name in names
-            if not name.startswith(".")
-        )
+        found = []
+        for parent, folders, names in os.walk(folder):
+            folders[:] = [name for name in folders if not name.startswith(".")]
+            found += [(Path(parent) / name).relative_to(self._root).as_posix() for name in names if not name.startswith(".")]
+        return sorted(found)
 
     def sync(self) -> None:
         """Flush what was written to the disk, so that a manifest never survives a power cut that its blocks did not."""

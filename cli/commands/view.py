@@ -1,0 +1,195 @@
+"""``clipmap view``: the reference client."""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from cli.output import emit_json, emit_pairs, format_bytes
+from schemas.errors import MissingExtraError, UsageError
+
+if TYPE_CHECKING:
+    from viewer.camera import Camera
+    from viewer.gl.headless import Picture
+    from viewer.options import ViewOptions
+    from viewer.scene import Scene
+
+
+def _numbers(_: click.Context, option: click.Parameter, value: str | None) -> tuple[float, ...] | None:
+    """Return the numbers of an option, as many as its metavar names."""
+    if value is None:
+        return None
+    names = str(option.metavar)
+    try:
+        numbers = tuple(float(part) for part in value.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != names.count(",") + 1 or not all(map(math.isfinite, numbers)):
+        raise click.BadParameter(f"{value!r}: expected numbers {names}")
+    return numbers
+
+
+def _size(_: click.Context, __: click.Parameter, value: str) -> tuple[int, int]:
+    """Return width and height in pixels."""
+    width, _cross, height = value.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise click.BadParameter(f"{value!r}: expected WIDTHxHEIGHT, e.g. 1280x720")
+    return int(width), int(height)
+
+
+@click.command(name="view")
+@click.argument("dataset", metavar="DATASET_OR_URL")
+@click.option("--headless", is_flag=True, help="Draw without a window, into PNG files. --out implies it.")
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="PNG to write; with --frames a pattern: frame_%04d.png.")
+@click.option("--frames", type=click.IntRange(min=1), default=1, show_default=True, help="Pictures to take on a circle around the view.")
+@click.option(
+    "--size", metavar="WxH", callback=_size, default="1280x720", show_default=True, help="Size of the picture or window in pixels."
+)
+@click.option("--view", metavar="X,Y,Z,YAW,PITCH", callback=_numbers, help="World position X, Y, metres Z, degrees from north and up.")
+@click.option("--look-at", metavar="X,Y", callback=_numbers, help="World position to look at from a place chosen for it.")
+@click.option("--fov", type=float, default=45.0, show_default=True, help="Vertical field of view in degrees.")
+@click.option("--exaggeration", type=float, default=1.0, show_default=True, help="Factor on heights.")
+@click.option(
+    "--sun", metavar="AZ,EL", callback=_numbers, default="315,40", show_default=True, help="Azimuth and elevation of the sun in degrees."
+)
+@click.option("--no-light", is_flag=True, help="Show imagery as it is, without a sun.")
+@click.option("--haze", type=float, metavar="KM", help="Distance in km at which haze hides 63 %; off by default.")
+@click.option(
+    "--grid", type=click.Choice(["63", "127", "255", "511"]), default="255", show_default=True, help="Vertices on a side of a level."
+)
+@click.option(
+    "--texture-window",
+    type=click.Choice(["256", "512", "1024", "2048", "4096"]),
+    default="1024",
+    show_default=True,
+    help="Texels along a texture level.",
+)
+@click.option("--samples", type=click.IntRange(min=0), default=4, show_default=True, help="Antialiasing samples per pixel, 0 for none.")
+@click.option("--wireframe", is_flag=True, help="Draw edges only.")
+@click.option("--color-by-level", is_flag=True, help="Tint by level of detail.")
+@click.option("--height", "height_layer", metavar="NAME", help="Height layer, if there are several.")
+@click.option("--imagery", "imagery_layer", metavar="NAME", help="Imagery layer, if there are several.")
+@click.option("--workers", type=click.IntRange(1, 64), default=4, show_default=True, help="Threads that load and decode blocks.")
+@click.option("--json", "as_json", is_flag=True, help="Report as JSON.")
+def command(dataset: str, **given: Any) -> None:  # noqa: ANN401 - click passes options by name
+    """Render a dataset, from a directory or from `clipmap serve`, in a window or headless.
+
+    In the window: WASD and Q/E to fly, drag the mouse to look, shift for speed, F1 wireframe, F2 levels, F3 freeze,
+    P to print the view, Esc to quit.
+    """
+    view_options = _options(given)
+    _require_moderngl()
+    from viewer.scene import open_scene
+    from viewer.source import open_source
+
+    source = open_source(dataset, view_options.workers)
+    try:
+        scene = open_scene(source, view_options)
+        try:
+            scene.load_coarsest()
+            camera = _camera(scene, view_options, given["view"], given["look_at"])
+            if given["headless"] or given["out"] is not None:
+                _render(scene, view_options, camera, given["out"] or Path(_default_name(dataset)), given["frames"], given["as_json"])
+            else:
+                _open_window(scene, view_options, camera, dataset)
+        finally:
+            scene.close()
+    finally:
+        source.close()
+
+
+def _options(given: dict[str, Any]) -> "ViewOptions":
+    from viewer.options import ViewOptions
+
+    if given["view"] is not None and given["look_at"] is not None:
+        raise UsageError("--view and --look-at both place the camera; give one of them")
+    return ViewOptions(
+        size=given["size"],
+        fov_deg=given["fov"],
+        exaggeration=given["exaggeration"],
+        sun_deg=None if given["no_light"] else given["sun"],
+        haze_m=None if given["haze"] is None else given["haze"] * 1000.0,
+        grid=int(given["grid"]),
+        texture_window=int(given["texture_window"]),
+        samples=given["samples"],
+        wireframe=given["wireframe"],
+        color_by_level=given["color_by_level"],
+        workers=given["workers"],
+        height_layer=given["height_layer"],
+        imagery_layer=given["imagery_layer"],
+    )
+
+
+def _require_moderngl() -> None:
+    from importlib.util import find_spec
+
+    if find_spec("moderngl") is None:
+        raise MissingExtraError("viewing needs moderngl: pip install 'clipmap[view]'")
+
+
+def _default_name(dataset: str) -> str:
+    return f"{Path(dataset.rstrip('/')).name or 'view'}.png"
+
+
+def _camera(
+    scene: "Scene", options: "ViewOptions", view: tuple[float, float, float, float, float] | None, look_at: tuple[float, float] | None
+) -> "Camera":
+    from viewer.framing import camera_at, default_camera
+
+    if view is not None:
+        return camera_at(scene, view, options.fov_deg)
+    target = None if look_at is None else scene.frame.local_of_world(*look_at)
+    return default_camera(scene, options, target)
+
+
+def _render(scene: "Scene", options: "ViewOptions", camera: "Camera", out: Path, frames: int, as_json: bool) -> None:
+    from viewer.framing import view_text
+    from viewer.gl.headless import HeadlessView, frame_paths, render_frames
+
+    paths = frame_paths(out, frames)
+    view = HeadlessView(scene, options)
+    pictures = list(render_frames(view, scene, camera, paths, options.exaggeration))
+    result = {
+        "renderer": view.renderer_name,
+        "pictures": [_picture(picture, view_text(scene, picture.camera)) for picture in pictures],
+        "width": options.size[0],
+        "height": options.size[1],
+        "blocks": scene.loader.counts.blocks,
+        "fetched_bytes": scene.loader.counts.fetched_bytes,
+        "uploaded_bytes": view.uploaded_bytes,
+    }
+    if as_json:
+        emit_json(result)
+        return
+    first = pictures[0]
+    emit_pairs(
+        [
+            ("renderer", view.renderer_name),
+            ("picture", str(first.path) if len(pictures) == 1 else f"{first.path} to {pictures[-1].path}"),
+            ("size", f"{options.size[0]} x {options.size[1]}, {options.samples or 1} samples"),
+            ("view", f"--view={view_text(scene, first.camera)}"),
+            ("triangles", f"{first.triangles:,}"),
+            ("blocks", f"{scene.loader.counts.blocks}, {format_bytes(scene.loader.counts.fetched_bytes)}"),
+            ("loading", f"{1e3 * sum(picture.load_s for picture in pictures):.0f} ms"),
+            ("drawing", f"{1e3 * sum(picture.draw_s for picture in pictures) / len(pictures):.0f} ms a frame"),
+        ]
+    )
+
+
+def _picture(picture: "Picture", view: str) -> dict[str, Any]:
+    return {
+        "path": str(picture.path),
+        "view": view,
+        "triangles": picture.triangles,
+        "load_s": round(picture.load_s, 6),
+        "draw_s": round(picture.draw_s, 6),
+    }
+
+
+def _open_window(scene: "Scene", options: "ViewOptions", camera: "Camera", title: str) -> None:
+    from viewer.framing import view_text
+    from viewer.gl.app import run_window
+
+    last = run_window(scene, options, camera, title, click.echo)
+    click.echo(f"--view={view_text(scene, last)}")

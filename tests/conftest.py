@@ -1,0 +1,33 @@
+"""Fixtures and settings that every test shares."""
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import nullcontext
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+settings.register_profile("local", deadline=None)
+settings.register_profile("ci", deadline=None, derandomize=True, database=None, print_blob=True)
+settings.load_profile("ci" if os.environ.get("CI") else "local")
+
+
+@pytest.fixture(autouse=True)
+def strict_floating_point() -> Iterator[None]:
+    """Turn 0/0, overflow and underflow into errors, so that a test cannot pass on NaN; only where NumPy is in use already."""
+    numpy = sys.modules.get("numpy")
+    with numpy.errstate(all="raise") if numpy else nullcontext():
+        yield
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """The folder of real inputs that ``CLIPMAP_TEST_DATA`` names; the test is skipped where there is none."""
+    name = os.environ.get("CLIPMAP_TEST_DATA")
+    if not name:
+        pytest.skip("CLIPMAP_TEST_DATA is not set: it names the folder of real inputs")
+    folder = Path(name)
+    assert folder.is_dir(), f"CLIPMAP_TEST_DATA={name} is not a folder"
+    return folder

@@ -1,0 +1,178 @@
+"""What is left when a build does not end, and what readers see while one is at work."""
+
+import itertools
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO
+import pytest
+
+from schemas.errors import InputError, NotFoundError, StorageError, UsageError
+from schemas.manifest import MANIFEST_NAME
+from tests.integration.files import assemble, opened, settings, tree_digest, write_tiff
+from tests.reference.terrain import photo
+from tiler.build import build_layer
+from tiler.stores.dataset import open_dataset
+
+
+def test_an_existing_layer_is_replaced_only_when_told(height_tiff: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    first = build_layer(height_tiff, out, settings())
+    with pytest.raises(UsageError, match="--overwrite"):
+        build_layer(height_tiff, out, settings(codec="lerc"))
+    second = build_layer(height_tiff, out, settings(codec="lerc", overwrite=True))
+    third = build_layer(height_tiff, out, settings(overwrite=True))
+    assert first.manifest.version != second.manifest.version
+    assert [report.manifest.layer("height").path for report in (first, second, third)] == ["height", "height.2", "height.3"]
+    assert sorted(path.name for path in out.iterdir()) == ["height.3", MANIFEST_NAME]
+    build_layer(height_tiff, tmp_path / "fresh", settings())
+    assert tree_digest(out / "height.3") == tree_digest(tmp_path / "fresh/height")
+
+
+def test_a_reader_of_the_old_version_sees_it_until_the_new_one_is_done(height_tiff: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    build_layer(height_tiff, out, settings())
+    before = assemble(open_dataset(out), "height", 0)[0]
+    seen = []
+
+    def look(done: int, total: int) -> None:
+        if done == total // 2:
+            seen.append(assemble(open_dataset(out), "height", 0)[0])
+
+    build_layer(height_tiff, out, settings(overwrite=True, height_offset=100.0, workers=1), look)
+    assert (seen[0] == before).all()
+    assert not np.array_equal(assemble(open_dataset(out), "height", 0)[0], before)
+
+
+def test_a_folder_with_other_things_is_left_alone(height_tiff: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/height").write_text("precious")
+    with pytest.raises(UsageError, match="not a dataset, and not empty"):
+        build_layer(height_tiff, tmp_path / "mine", settings())
+    assert (tmp_path / "mine/height").read_text() == "precious"
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["height"]
+
+
+def test_a_failed_build_leaves_nothing(tmp_path: Path) -> None:
+    """The tiles at the end of the file are cut off: noticed only when they are read, long after blocks were stored."""
+    source = write_tiff(tmp_path / "cut.tif", photo(512, 512), compress="deflate")
+    source.write_bytes(source.read_bytes()[: source.stat().st_size * 3 // 4])
+    with pytest.raises(InputError, match=r"cut\.tif"):
+        build_layer(source, tmp_path / "out", settings(workers=1, task=64))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_full_disk_is_a_sentence(height_tiff: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = itertools.count()
+    rename = os.replace
+
+    def replace(old: Any, new: Any) -> None:
+        if next(calls) == 40:
+            raise OSError(28, os.strerror(28))
+        rename(old, new)
+
+    monkeypatch.setattr(os, "replace", replace)
+    with pytest.raises(StorageError, match="No space left on device"):
+        build_layer(height_tiff, tmp_path / "out", settings())
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_builds_exclude_each_other(height_tiff: Path, tmp_path: Path) -> None:
+    refused = []
+
+    def intrude(done: int, total: int) -> None:
+        if done == 1:
+            with pytest.raises(StorageError, match=rf"another build is writing here \(process {os.getpid()}\)") as error:
+                build_layer(height_tiff, tmp_path / "out", settings())
+            refused.append(error)
+
+    build_layer(height_tiff, tmp_path / "out", settings(workers=1), intrude)
+    assert len(refused) == 1
+    open_dataset(tmp_path / "out")
+
+
+BUILD = "import sys; from cli.main import run; sys.exit(run(sys.argv[1:]))"
+
+
+def test_kill_leaves_no_dataset_that_opens_as_complete(tmp_path: Path) -> None:
+    """``kill -9`` at random moments; then the same command makes the same dataset as an undisturbed build."""
+    source = write_tiff(tmp_path / "photo.tif", photo(1024, 1024, seed=8))
+    arguments = [sys.executable, "-c", BUILD, "build", str(source), "--block", "32", "--task", "64", "--codec", "png"]
+    subprocess.run([*arguments, "-o", str(tmp_path / "whole")], check=True, capture_output=True)
+    chance, killed, out = random.Random(20261122), 0, tmp_path / "killed"
+    for _ in range(6):
+        process = subprocess.Popen([*arguments, "-o", str(out)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        blocks = chance.randrange(1, 600)
+        while process.poll() is None and len(list(out.glob("imagery/*/*.png"))) < blocks:
+            time.sleep(0.005)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        if (out / MANIFEST_NAME).exists():
+            break
+        killed += 1
+        with pytest.raises(NotFoundError, match=r"not a dataset|no dataset"):
+            open_dataset(out)
+    assert killed, "no build was caught in the act"
+    if not (out / MANIFEST_NAME).exists():
+        subprocess.run([*arguments, "-o", str(out)], check=True, capture_output=True)
+    assert tree_digest(out / "imagery") == tree_digest(tmp_path / "whole/imagery")
+    assert (out / MANIFEST_NAME).read_bytes() == (tmp_path / "whole" / MANIFEST_NAME).read_bytes()
+
+
+def test_interrupt_leaves_nothing(tmp_path: Path) -> None:
+    source = write_tiff(tmp_path / "photo.tif", photo(1024, 1024, seed=8))
+    arguments = [
+        sys.executable,
+        "-c",
+        BUILD,
+        "build",
+        str(source),
+        "--block",
+        "32",
+        "--task",
+        "64",
+        "--codec",
+        "png",
+        "-o",
+        str(tmp_path / "o"),
+    ]
+    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 60
+    while not list((tmp_path / "o").glob("imagery/0/*.png")) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert errors.strip() == "clipmap: interrupted"
+    assert not (tmp_path / "o").exists()
+
+
+def test_memory_is_bounded_by_the_rows_in_flight(tmp_path: Path) -> None:
+    """8192 x 8192 RGB is 201 MB raw and 805 MB as float32; the build's peak must stay under 400 MB."""
+    side = 8192
+    source = tmp_path / "large.tif"
+    spec = OpenImageIO.ImageSpec(side, side, 3, "uint8")
+    spec.tile_width = spec.tile_height = 512
+    spec.attribute("compression", "none")
+    output = opened(source, spec)
+    tile = photo(512, 512, seed=5)
+    for y, x in itertools.product(range(0, side, 512), range(0, side, 512)):
+        assert output.write_tile(x, y, 0, tile)
+    output.close()
+    result = subprocess.run(
+        [sys.executable, "-c", BUILD, "build", str(source), "-o", str(tmp_path / "out"), "--workers", "2", "--json"],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    report = json.loads(result.stdout)
+    assert report["peak_rss_bytes"] < 400e6
+    assert report["blocks_stored"] == 1024 + 256 + 64 + 16 + 4 + 1
