@@ -26,6 +26,7 @@ Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
 Transform = tuple[float, float, float, float, float, float]
 SampleType = Literal["uint8", "uint16", "float32"]
 LayerKind = Literal["imagery", "height"]
+Clamp = Literal["none", "local"]
 KernelName = Literal["blackman-sinc", "kaiser", "lanczos", "triangle", "box"]
 
 
@@ -70,6 +71,7 @@ class Filter(Model):
     kernel: KernelName = Field(description="Kernel, one dimension of a separable filter")
     radius: int = Field(ge=1, description="Kernel radius [coarse samples]")
     edge: Literal["antisymmetric", "mirror"] = Field(description="What a filter sees beyond the source's edge")
+    clamp: Clamp = Field(default="none", description="'local': coarse samples were kept in the range of the valid samples under their taps")
     void: Literal["guarded-normalised"] = Field(
         default="guarded-normalised", description="How voids and alpha are weighed: normalised convolution with a guarded fallback"
     )

@@ -5,7 +5,7 @@ from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from schemas.manifest import KernelName, LayerKind
+from schemas.manifest import Clamp, KernelName, LayerKind
 
 HeightEncoding = Literal["terrarium", "terrain-rgb"]
 
@@ -21,18 +21,22 @@ class BuildSettings(Settings):
 
     layer: LayerKind | None = Field(default=None, description="Kind of the layer; guessed from the source where safe")
     block: int = Field(default=256, description="Side of a block's core [samples], a power of two")
+    pad: int = Field(default=0, ge=0, description="Stored border of a block, copied from its neighbours [samples]")
     codec: str | None = Field(default=None, description="Block codec, e.g. jpeg:85, png, webp:90, lerc:0.01")
     filter: KernelName = Field(default="blackman-sinc", description="Kernel that makes coarser levels")
     radius: int | None = Field(
         default=None, ge=1, le=16, description="Kernel radius [coarse samples]; 6 for heights, 3 for imagery, 1 for box and triangle"
     )
+    clamp: Clamp = Field(default="none", description="'local' keeps coarse samples in the range of those under their taps: no ringing")
     task: int = Field(default=2048, ge=2, description="Side of a task [level-0 samples]; has no effect on the result")
     workers: int | None = Field(
         default=None, ge=1, le=256, description="Threads; default: the processors there are; has no effect on the result"
     )
     bands: tuple[int, ...] | None = Field(default=None, min_length=1, max_length=4, description="Channels to take, from 1; all by default")
     nodata: float | None = Field(default=None, description="Value that marks a void in the source; NaN always does")
-    decode: HeightEncoding | None = Field(default=None, description="How heights are hidden in the source's colour channels")
+    decode: HeightEncoding | Literal["none"] | None = Field(
+        default=None, description="How heights are hidden in the source's colour channels; 'none': they are not, whatever it looks like"
+    )
     height_scale: float = Field(default=1.0, allow_inf_nan=False, description="Metres per unit of the source")
     height_offset: float = Field(default=0.0, allow_inf_nan=False, description="Metres added after scaling [m]")
     spacing: float | None = Field(

@@ -23,6 +23,7 @@ from tiler.ledger import Ledger
 from tiler.plan import Plan, plan_layer
 from tiler.rowfile import RowFile
 from tiler.sources.convert import Source, choose_conversion
+from tiler.sources.disguise import refuse_disguised_heights
 from tiler.sources.files import open_file
 from tiler.stores.dataset import read_manifest
 from tiler.stores.directory import DirectoryStore
@@ -64,7 +65,10 @@ def build_layer(path: Path, output: Path, settings: BuildSettings, on_progress: 
             _refuse_foreign(output)
         reader = open_file(path, output)
         try:
-            plan = plan_layer(Source(reader, choose_conversion(reader.info, settings)), dataset, settings)
+            source = Source(reader, choose_conversion(reader.info, settings))
+            plan = plan_layer(source, dataset, settings)
+            if settings.decode is None:
+                refuse_disguised_heights(reader, source.conversion)
             manifest, times = _build(plan, store, dataset, output, on_progress)
         finally:
             reader.close()
@@ -178,7 +182,8 @@ class _TaskRunner:
         """Run ``task``; returns the seconds it took by stage."""
         plan, tier = self._plan, task.tier
         size = plan.lattice.level_size(tier.first)
-        windows = held_windows(size, task.core, tier.count + tier.carry, plan.recipe.kernel.reach)
+        pads = [plan.lattice.pad] * tier.count + [0] * tier.carry
+        windows = held_windows(size, task.core, pads, plan.recipe.kernel.reach)
         cutter = Cutter(self._target, tier.first, task.core, self._ledger.note)
 
         def sink(step: int, first: int, values: Values, coverage: Coverage | None) -> None:
@@ -236,7 +241,7 @@ def _layer_entry(plan: Plan, target: Target, ledger: Ledger) -> Layer:
         max_error=plan.codec.max_error,
         transform=plan.placement.transform,
         ground_spacing_m=plan.placement.ground_spacing_m,
-        filter=Filter(kernel=kernel.name, radius=kernel.radius, edge=plan.recipe.edge),
+        filter=Filter(kernel=kernel.name, radius=kernel.radius, edge=plan.recipe.edge, clamp="local" if plan.recipe.clamp else "none"),
         source=_source_entry(plan),
         statistics=ledger.statistics(),
         levels=[ledger.level(level) for level in range(plan.lattice.levels)],

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from schemas.lattice import support
 from schemas.region import Rect
-from tiler.decimate import coarsen_columns, coarsen_partial, coarsen_rows, flag_partial
+from tiler.decimate import clamp_to_support, coarsen_columns, coarsen_partial, coarsen_rows, flag_partial
 from tiler.edges import EdgeRule, extend
 from tiler.kernels import Kernel, covering
 
@@ -29,19 +29,22 @@ def halve(size: tuple[int, int]) -> tuple[int, int]:
     return -(-size[0] // 2), -(-size[1] // 2)
 
 
-def held_windows(size: tuple[int, int], core: Rect, levels: int, reach: tuple[int, int]) -> list[Rect]:
-    """Return, per level, the samples a window must hold so that each of ``levels`` levels covers its share of ``core``.
+def held_windows(size: tuple[int, int], core: Rect, pads: Sequence[int], reach: tuple[int, int]) -> list[Rect]:
+    """Return, per level, the samples a window must hold so that each level covers its share of ``core`` and its pad around it.
 
     ``size`` is (width, height) of the finest level and ``core`` its samples wanted, aligned to ``2**(levels - 1)`` except
-    at the right and bottom edge; ``reach`` is the kernel's. The finest window is ``core`` plus the halo of all levels.
+    at the right and bottom edge; ``pads`` has one entry per level, finest first; ``reach`` is the kernel's. The finest window is
+    ``core`` plus the halo of all levels.
     """
+    levels = len(pads)
     sizes = [size]
     for _ in range(levels - 1):
         sizes.append(halve(sizes[-1]))
     windows: list[Rect] = []
     for level in range(levels - 1, -1, -1):
         whole = Rect(0, 0, *sizes[level])
-        own = Rect(core.x0 >> level, core.y0 >> level, -(-core.x1 >> level), -(-core.y1 >> level)) & whole
+        share = Rect(core.x0 >> level, core.y0 >> level, -(-core.x1 >> level), -(-core.y1 >> level))
+        own = (share & whole).grown(pads[level]) & whole
         if windows:
             seen = support(windows[-1], reach) & whole
             own = Rect(min(own.x0, seen.x0), min(own.y0, seen.y0), max(own.x1, seen.x1), max(own.y1, seen.y1))
@@ -51,11 +54,12 @@ def held_windows(size: tuple[int, int], core: Rect, levels: int, reach: tuple[in
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """How a level becomes the next: the kernel, the edge rule, and whether samples may be void."""
+    """How a level becomes the next: kernel, edge rule, whether samples may be void and whether they stay in their support's range."""
 
     kernel: Kernel
     edge: EdgeRule
     masked: bool
+    clamp: bool = False
 
 
 class _Stage:
@@ -141,6 +145,8 @@ class _Stage:
         row, column = 2 * first - self._top, 2 * self._coarse.x0 - (self._fine.x0 - self._left)
         values = self._filtered(row, column, count)
         coverage = self._partial(row, column, values)
+        if self._recipe.clamp:
+            self._clamp(row, column, values)
         self._next = last
         keep = 2 * last - self._before - self._top
         if keep > 0:
@@ -172,6 +178,20 @@ class _Stage:
                 self._values, self._coverage, row, column, offsets, weights, positive, positive_weights, flags, values, coverage
             )
         return coverage
+
+    def _clamp(self, row: int, column: int, values: Values) -> None:
+        offsets, _ = self._recipe.kernel.taps()
+        inside = (
+            max(0, -self._top),
+            min(len(self._values), self._size[1] - self._top),
+            self._left,
+            self._left + self._fine.width,
+        )
+        coverage = _NO_COVERAGE if self._coverage is None else self._coverage
+        clamp_to_support(self._values, coverage, row, column, offsets, inside, values)
+
+
+_NO_COVERAGE = np.empty((0, 0), np.float32)
 
 
 class Cascade:

@@ -83,17 +83,42 @@ def round_samples(values: Values, coverage: Coverage | None, block: BlockFormat)
 
 @dataclass(slots=True)
 class _Strip:
-    """Rounded rows of a level that wait for their block row to be complete."""
+    """Rounded rows of a level, from row ``top`` on, that wait for the block row ``block_y`` to be complete."""
 
+    top: int
+    block_y: int
     samples: list[Samples] = field(default_factory=list)
     masks: list[Mask] = field(default_factory=list)
+    rows: int = 0
+
+    def append(self, samples: Samples, mask: Mask | None) -> None:
+        """Add rows at the bottom."""
+        self.samples.append(samples)
+        if mask is not None:
+            self.masks.append(mask)
+        self.rows += len(samples)
+
+    def joined(self) -> tuple[Samples, Mask | None]:
+        """Return all rows in one piece."""
+        if len(self.samples) > 1:
+            self.samples = [np.concatenate(self.samples)]
+            self.masks = [np.concatenate(self.masks)] if self.masks else []
+        return self.samples[0], self.masks[0] if self.masks else None
+
+    def drop_above(self, y: int) -> None:
+        """Forget the rows above ``y``."""
+        samples, mask = self.joined()
+        gone = max(0, y - self.top)
+        self.samples = [samples[gone:]]
+        self.masks = [] if mask is None else [mask[gone:]]
+        self.top, self.rows = self.top + gone, self.rows - gone
 
 
 class Cutter:
     """Takes the rows a cascade emits for one task and stores the blocks of its levels.
 
-    ``core`` are the task's samples of level ``first_level``; rows and columns outside it (the halo) are dropped. ``on_block`` is
-    called once per finished block.
+    ``core`` are the task's samples of level ``first_level``; rows and columns beyond it and its pad (the halo) are dropped.
+    ``on_block`` is called once per finished block.
     """
 
     def __init__(self, target: Target, first_level: int, core: Rect, on_block: Callable[[CutBlock], None]) -> None:
@@ -106,43 +131,45 @@ class Cutter:
 
     def take(self, level: int, first: int, values: Values, coverage: Coverage | None, left: int) -> None:
         """Take rows ``first`` and following of ``level``, whose first column is ``left``."""
+        lattice = self._target.lattice
         shift = level - self._first_level
         core = Rect(self._core.x0 >> shift, self._core.y0 >> shift, -(-self._core.x1 >> shift), -(-self._core.y1 >> shift))
-        rows = slice(max(core.y0 - first, 0), core.y1 - first)
-        columns = slice(core.x0 - left, core.x1 - left)
-        values, coverage = values[rows, columns], None if coverage is None else coverage[rows, columns]
-        y = max(first, core.y0)
-        block = self._target.lattice.block
-        done = 0
-        while done < len(values):
-            end = min(done + block - (y + done) % block, len(values))
-            samples, mask = round_samples(values[done:end], None if coverage is None else coverage[done:end], self._target.block)
-            strip = self._strips.setdefault(level, _Strip())
-            strip.samples.append(samples)
-            if mask is not None:
-                strip.masks.append(mask)
-            done = end
-            if (y + done) % block == 0 or y + done == core.y1:
-                self._cut_strip(level, core.x0, (y + done - 1) // block, self._strips.pop(level))
+        padded = core.grown(lattice.pad) & lattice.level_rect(level)
+        rows, columns = slice(max(padded.y0 - first, 0), max(padded.y1 - first, 0)), slice(padded.x0 - left, padded.x1 - left)
+        part, covered = values[rows, columns], None if coverage is None else coverage[rows, columns]
+        if not len(part):
+            return
+        strip = self._strips.get(level)
+        if strip is None:
+            strip = self._strips[level] = _Strip(padded.y0, core.y0 // lattice.block)
+        strip.append(*round_samples(part, covered, self._target.block))
+        self._cut_complete(level, strip, core, padded)
 
-    def _cut_strip(self, level: int, x0: int, block_y: int, strip: _Strip) -> None:
-        samples = np.concatenate(strip.samples)
-        mask = np.concatenate(strip.masks) if strip.masks else None
-        block = self._target.lattice.block
-        for start in range(0, samples.shape[1], block):
-            address = BlockAddress(level, (x0 + start) // block, block_y)
-            part = slice(start, start + block)
-            self._on_block(self._finish(address, samples[:, part], None if mask is None else mask[:, part]))
+    def _cut_complete(self, level: int, strip: _Strip, core: Rect, padded: Rect) -> None:
+        block, pad = self._target.lattice.block, self._target.lattice.pad
+        while strip.block_y * block < core.y1 and strip.top + strip.rows >= min((strip.block_y + 1) * block + pad, padded.y1):
+            samples, mask = strip.joined()
+            for x in range(core.x0 // block, -(-core.x1 // block)):
+                address = BlockAddress(level, x, strip.block_y)
+                seen = self._target.lattice.core(address).grown(pad) & padded
+                window = np.s_[seen.y0 - strip.top : seen.y1 - strip.top, seen.x0 - padded.x0 : seen.x1 - padded.x0]
+                self._on_block(self._finish(address, seen, samples[window], None if mask is None else mask[window]))
+            strip.block_y += 1
+            strip.drop_above(strip.block_y * block - pad)
 
-    def _finish(self, address: BlockAddress, samples: Samples, mask: Mask | None) -> CutBlock:
+    def _finish(self, address: BlockAddress, seen: Rect, samples: Samples, mask: Mask | None) -> CutBlock:
+        """Measure the core, encode core and pad, store; ``samples`` are those of ``seen``, what of the padded block the level has."""
         target = self._target
-        valid = samples[..., -1] > 0 if target.block.alpha else mask
-        count, (minima, maxima, sums) = measure(samples, valid, samples.shape[-1] - target.block.alpha)
+        own = target.lattice.valid_core(address).shifted(-seen.x0, -seen.y0)
+        core = np.s_[own.y0 : own.y1, own.x0 : own.x1]
+        valid = samples[core][..., -1] > 0 if target.block.alpha else None if mask is None else mask[core]
+        count, (minima, maxima, sums) = measure(samples[core], valid, samples.shape[-1] - target.block.alpha)
         if not count:
             return CutBlock(address, BLANK, (), (), ())
         low, high = float(minima.min()), float(maxima.max())
         started = perf_counter()
-        data = target.codec.encode(*_padded(self._within_range(address, samples, low, high), mask, target.block))
+        whole = target.lattice.core(address).grown(target.lattice.pad)
+        data = target.codec.encode(*_completed(self._within_range(address, samples, low, high), mask, seen, whole, target.block))
         encoded = perf_counter()
         target.store.write(target.key(address), data)
         self.times.encode_s += encoded - started
@@ -152,34 +179,34 @@ class Cutter:
     def _within_range(self, address: BlockAddress, samples: Samples, low: float, high: float) -> Samples:
         """Refuse source values the codec cannot hold; clip what the filter overshot on coarser levels."""
         limits = self._target.codec.value_range
-        if limits is None or (limits[0] <= low and high <= limits[1]):
+        if limits is None:
             return samples
-        if address.level == 0:
+        if address.level:
+            return np.clip(samples, np.float32(limits[0]), np.float32(limits[1]))
+        if low < limits[0] or high > limits[1]:
             raise InputError(
                 f"codec {self._target.codec.spec} holds values from {limits[0]:g} to {limits[1]:g} only, but the source has "
                 f"{low:g} to {high:g} in block {address}; use another scale and offset, or lerc"
             )
-        return np.clip(samples, np.float32(limits[0]), np.float32(limits[1]))
+        return samples
 
 
 def _floats(values: NDArray[np.generic]) -> tuple[float, ...]:
     return tuple(float(value) for value in values)
 
 
-def _padded(samples: Samples, mask: Mask | None, block: BlockFormat) -> tuple[Samples, Mask | None]:
-    """Fill a block that overhangs its level by repeating the edge, never black; transparent if there is alpha, void for heights.
+def _completed(samples: Samples, mask: Mask | None, seen: Rect, whole: Rect, block: BlockFormat) -> tuple[Samples, Mask | None]:
+    """Fill what of ``whole`` lies outside its level by repeating the edge, never black; transparent if there is alpha, void for heights.
 
     Void padding is what a client must see (there is no ground), and it costs nothing: coded as ground, the repeated last row of a
     1025 x 1025 terrain takes as many bytes as a full block.
     """
-    rows, columns = samples.shape[:2]
-    if (rows, columns) == (block.side, block.side):
+    if seen == whole:
         return samples, mask
-    missing = ((0, block.side - rows), (0, block.side - columns))
-    padded = np.pad(samples, (*missing, (0, 0)), mode="edge")
+    missing = ((seen.y0 - whole.y0, whole.y1 - seen.y1), (seen.x0 - whole.x0, whole.x1 - seen.x1))
+    completed = np.pad(samples, (*missing, (0, 0)), mode="edge")
     if block.alpha:
-        padded[rows:, :, -1] = 0
-        padded[:, columns:, -1] = 0
+        completed[..., -1] = np.pad(samples[..., -1], missing)
     if block.kind == "height":
-        mask = np.pad(np.ones((rows, columns), np.bool_) if mask is None else mask, missing)
-    return padded, mask
+        mask = np.pad(np.ones(samples.shape[:2], np.bool_) if mask is None else mask, missing)
+    return completed, mask

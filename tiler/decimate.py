@@ -14,6 +14,7 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 Flags = NDArray[np.uint8]
+Bounds = tuple[int, int, int, int]
 
 _CHUNK = 1024
 """Columns filtered at once: reference and sum (8 KiB) stay in the first-level cache."""
@@ -195,3 +196,46 @@ def coarsen_partial(
                 if blend > 0.0:
                     detail = blend / weight * _moment(fine, channel, mean, coverage, row, column, offsets, weights)
                 coarse[j, i, channel] = np.float32(mean + detail)
+
+
+@numba.njit(nogil=True, cache=True)
+def _range_of_rows(fine: Float32, coverage: Float32, centre: int, offsets: Int64, inside: Bounds, low: Float32, high: Float32) -> None:
+    """Set ``low`` and ``high`` (columns, c) to the range of each column of ``fine`` over the taps around row ``centre``."""
+    low[:] = np.float32(np.inf)
+    high[:] = np.float32(-np.inf)
+    masked = coverage.size > 0
+    for offset in offsets:
+        y = centre + offset
+        if y < inside[0] or y >= inside[1]:
+            continue
+        for x in range(inside[2], inside[3]):
+            if masked and coverage[y, x] == 0:
+                continue
+            for channel in range(fine.shape[2]):
+                low[x, channel] = min(low[x, channel], fine[y, x, channel])
+                high[x, channel] = max(high[x, channel], fine[y, x, channel])
+
+
+@numba.njit(nogil=True, cache=True)
+def clamp_to_support(
+    fine: Float32, coverage: Float32, first_row: int, first_column: int, offsets: Int64, inside: Bounds, coarse: Float32
+) -> None:
+    """Clamp ``coarse`` (m, n, c) to the range of the samples of ``fine`` under its taps.
+
+    Only samples of the level itself count, rows ``inside[0]`` up to before ``inside[1]`` and columns ``inside[2]`` up to before
+    ``inside[3]``, and only those with some ``coverage`` (all, if it is empty): what an edge rule made up or what a void hides
+    does not widen the range.
+    """
+    low = np.empty(fine.shape[1:], np.float32)
+    high = np.empty(fine.shape[1:], np.float32)
+    for j in range(coarse.shape[0]):
+        _range_of_rows(fine, coverage, first_row + 2 * j, offsets, inside, low, high)
+        for i in range(coarse.shape[1]):
+            for channel in range(coarse.shape[2]):
+                least, most = np.float32(np.inf), np.float32(-np.inf)
+                for offset in offsets:
+                    x = first_column + 2 * i + offset
+                    if inside[2] <= x < inside[3]:
+                        least, most = min(least, low[x, channel]), max(most, high[x, channel])
+                if least <= most:
+                    coarse[j, i, channel] = min(max(coarse[j, i, channel], least), most)

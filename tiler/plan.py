@@ -62,7 +62,7 @@ def plan_layer(source: Source, dataset: Manifest | None, settings: BuildSettings
     if dataset is not None and name in dataset.layers and not settings.overwrite:
         raise UsageError(f"the dataset has a layer {name!r} already; add --overwrite to replace it, or choose another folder")
     defaults = _DEFAULTS[conversion.kind]
-    lattice = Lattice(info.width, info.height, settings.block, defaults.registration)
+    lattice = Lattice(info.width, info.height, settings.block, defaults.registration, settings.pad)
     columns, rows = lattice.block_counts(0)
     if columns * rows > _MAX_BLOCKS:
         raise UsageError(f"{info.path}: would make {columns * rows} blocks, more than {_MAX_BLOCKS}; use a larger --block")
@@ -80,7 +80,7 @@ def plan_layer(source: Source, dataset: Manifest | None, settings: BuildSettings
         source=source,
         name=name,
         lattice=lattice,
-        recipe=Recipe(kernel, defaults.edge, source.masked),
+        recipe=Recipe(kernel, defaults.edge, source.masked, settings.clamp == "local"),
         block=block,
         codec=open_codec(_codec_spec(source, block, settings), block),
         placement=place(info, defaults.registration, settings.spacing, dataset, name),

@@ -48,10 +48,22 @@ def _settings(options: dict[str, Any]) -> BuildSettings:
     help="Kernel that makes coarser levels.",
 )
 @click.option("--radius", type=int, help="Kernel radius in coarse samples.  [default: 6 for heights, 3 for imagery]")
+@click.option(
+    "--clamp",
+    type=click.Choice(["none", "local"]),
+    default="none",
+    show_default=True,
+    help="local: no ringing; coarse samples stay in the range of those under their taps.",
+)
+@click.option("--pad", type=int, default=0, show_default=True, help="Stored border of every block, in samples, copied from its neighbours.")
 @click.option("--spacing", type=float, help="Metres between samples, for a source without georeference.")
 @click.option("--height-scale", type=float, default=1.0, show_default=True, help="Metres per unit of the source.")
 @click.option("--height-offset", type=float, default=0.0, show_default=True, help="Metres added after scaling.")
-@click.option("--decode", type=click.Choice(["terrarium", "terrain-rgb"]), help="Heights are hidden in the source's colours, in this way.")
+@click.option(
+    "--decode",
+    type=click.Choice(["terrarium", "terrain-rgb", "none"]),
+    help="Heights are hidden in the source's colours, in this way; none: it is a picture, even if it looks like hidden heights.",
+)
 @click.option("--nodata", type=float, help="Value that marks a void, instead of the one the file declares.")
 @click.option("--bands", callback=_bands, help="Channels to take, from 1, e.g. 1,2,3.")
 @click.option("--workers", type=int, help="Threads; no effect on the result.  [default: all processors]")

@@ -10,6 +10,7 @@ import rasterio
 from affine import Affine
 from numpy.typing import NDArray
 
+from schemas.address import BlockAddress
 from schemas.settings import BuildSettings
 from tiler.codecs import BlockFormat, open_codec
 from tiler.stores.dataset import Dataset
@@ -27,21 +28,29 @@ def write_tiff(path: Path, pixels: Picture, **profile: Any) -> Path:
     return path
 
 
+def decode(dataset: Dataset, name: str, address: BlockAddress) -> tuple[Picture, NDArray[np.bool_]]:
+    """Decode a block with its pad; a blank is void everywhere."""
+    layer = dataset.manifest.layer(name)
+    side = layer.lattice.stored_side
+    data = dataset.block(name, address)
+    if data is None:
+        return np.zeros((side, side, layer.channels), layer.dtype), np.zeros((side, side), np.bool_)
+    samples, mask = open_codec(layer.codec, BlockFormat(layer.kind, side, layer.channels, layer.dtype, layer.alpha)).decode(data)
+    return samples, np.ones((side, side), np.bool_) if mask is None else mask
+
+
 def assemble(dataset: Dataset, name: str, level: int) -> tuple[Picture, NDArray[np.bool_]]:
     """Decode all blocks of a level into one picture and its mask, padding included."""
     layer = dataset.manifest.layer(name)
-    block = BlockFormat(layer.kind, layer.lattice.stored_side, layer.channels, layer.dtype, layer.alpha)
-    codec = open_codec(layer.codec, block)
     columns, rows = layer.lattice.block_counts(level)
     samples = np.zeros((rows * layer.block, columns * layer.block, layer.channels), layer.dtype)
     mask = np.zeros(samples.shape[:2], np.bool_)
+    core = np.s_[layer.pad : layer.pad + layer.block, layer.pad : layer.pad + layer.block]
     for address in layer.lattice.addresses(level):
-        data = dataset.block(name, address)
-        if data is not None:
-            core = layer.lattice.core(address)
-            part, valid = codec.decode(data)
-            samples[core.y0 : core.y1, core.x0 : core.x1] = part
-            mask[core.y0 : core.y1, core.x0 : core.x1] = True if valid is None else valid
+        there = layer.lattice.core(address)
+        part, valid = decode(dataset, name, address)
+        samples[there.y0 : there.y1, there.x0 : there.x1] = part[core]
+        mask[there.y0 : there.y1, there.x0 : there.x1] = valid[core]
     return samples, mask
 
 

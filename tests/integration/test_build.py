@@ -12,7 +12,7 @@ from schemas.address import BlockAddress
 from schemas.errors import UsageError
 from schemas.manifest import digest
 from schemas.region import Rect
-from tests.integration.files import assemble, settings, tree_digest, write_png, write_tiff
+from tests.integration.files import assemble, decode, settings, tree_digest, write_png, write_tiff
 from tests.reference.terrain import photo, terrain
 from tiler.build import build_layer
 from tiler.cascade import Cascade, Coverage, Recipe, Values, held_windows
@@ -28,7 +28,7 @@ def whole_level(values: Values, coverage: Coverage | None, level: int, kind: str
     height, width, channels = values.shape
     kernel = blackman_sinc(radius, registration)  # type: ignore[arg-type]
     found: list[tuple[Values, Coverage | None]] = []
-    windows = held_windows((width, height), Rect(0, 0, width, height), level + 1, kernel.reach)
+    windows = held_windows((width, height), Rect(0, 0, width, height), [0] * (level + 1), kernel.reach)
     recipe = Recipe(kernel, edge, coverage is not None)  # type: ignore[arg-type]
     Cascade((width, height), windows, channels, recipe, lambda n, _, v, c: found.append((v, c)) if n == level else None).push(
         values, coverage
@@ -71,6 +71,32 @@ def test_no_seams(name: str, codec: str, height_tiff: Path, photo_tiff: Path, tm
             found = np.where(valid[..., np.newaxis], found, np.float32(0))[:height, :width]
             rounded = np.where(mask[..., np.newaxis], rounded, np.float32(0))
         assert found[:height, :width].tobytes() == rounded.tobytes()
+
+
+@pytest.mark.parametrize("name", ["height", "photo"])
+@pytest.mark.parametrize("pad", [1, 4, 16])
+def test_pads_equal_the_neighbours_cores(name: str, pad: int, height_tiff: Path, photo_tiff: Path, tmp_path: Path) -> None:
+    """Bit for bit, on every level, for every task size; beyond the level the edge is repeated and void."""
+    source = height_tiff if name == "height" else photo_tiff
+    build_layer(source, tmp_path / "out", settings(pad=pad, task=64))
+    build_layer(source, tmp_path / "large", settings(pad=pad, task=4096, workers=1))
+    assert tree_digest(tmp_path / "out") == tree_digest(tmp_path / "large")
+    build_layer(source, tmp_path / "bare", settings())
+    padded, bare = open_dataset(tmp_path / "out"), open_dataset(tmp_path / "bare")
+    (layer_name,) = bare.manifest.layers
+    for level in bare.manifest.layers[layer_name].levels:
+        whole, valid = assemble(bare, layer_name, level.level)
+        for address in padded.manifest.layers[layer_name].lattice.addresses(level.level):
+            samples, mask = decode(padded, layer_name, address)
+            if not mask.any():
+                assert bare.record(layer_name, address).blank
+                continue
+            around = padded.manifest.layers[layer_name].lattice.core(address).grown(pad)
+            seen = around & Rect(0, 0, level.width, level.height)
+            inside = np.s_[seen.y0 - around.y0 : seen.y1 - around.y0, seen.x0 - around.x0 : seen.x1 - around.x0]
+            there = np.s_[seen.y0 : seen.y1, seen.x0 : seen.x1]
+            assert (mask[inside] == valid[there]).all()
+            assert samples[inside][valid[there]].tobytes() == whole[there][valid[there]].tobytes()
 
 
 def test_padding_repeats_the_edge(photo_tiff: Path, tmp_path: Path) -> None:
@@ -123,7 +149,7 @@ def test_index_and_statistics_tell_the_truth(height_tiff: Path, tmp_path: Path) 
         if (data := dataset.block("height", address)) is not None:
             assert (record.length_bytes, record.digest) == (len(data), digest(data))
             assert (record.min, record.max) == (np.nanmin(part), np.nanmax(part))
-    assert layer.transform == (10, 0, 500_005, 0, -10, 4_999_995), "vertices sit in pixel centres"
+    assert list(layer.transform) == [10, 0, 500_005, 0, -10, 4_999_995], "vertices sit in pixel centres"
     assert layer.ground_spacing_m == pytest.approx((10.004, 10.004), abs=1e-3)
 
 

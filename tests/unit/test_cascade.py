@@ -36,19 +36,21 @@ def run_cascade(
     kind: str = "height",
     radius: int = 6,
     core: Rect | None = None,
+    pad: int = 0,
+    clamp: bool = False,
     portion: int = 1 << 30,
 ) -> list[LevelRows]:
     """Return (held window, values, coverage) of every level for one window of the whole picture."""
     registration, edge = KINDS[kind]
     height, width, channels = values.shape
     kernel = blackman_sinc(radius, registration)
-    windows = held_windows((width, height), core or Rect(0, 0, width, height), levels, kernel.reach)
+    windows = held_windows((width, height), core or Rect(0, 0, width, height), [pad] * levels, kernel.reach)
     rows: list[list[tuple[int, Values, Coverage | None]]] = [[] for _ in range(levels)]
     cascade = Cascade(
         (width, height),
         windows,
         channels,
-        Recipe(kernel, edge, coverage is not None),
+        Recipe(kernel, edge, coverage is not None, clamp),
         lambda level, first, part, covered: rows[level].append((first, part.copy(), None if covered is None else covered.copy())),
     )
     whole = windows[0]
@@ -255,21 +257,43 @@ def pictures(draw: st.DrawFn) -> tuple[Values, Coverage | None, str, int, int]:
     return values, coverage, draw(st.sampled_from(sorted(KINDS))), draw(st.integers(1, 6)), draw(st.integers(2, 5))
 
 
-@given(picture=pictures(), side=st.sampled_from([16, 32]), portion=st.integers(1, 40))
-@example(picture=(np.ones((1, 1, 1), np.float32), None, "height", 6, 5), side=16, portion=1)
-def test_any_window_gives_the_bits_of_the_whole(picture: tuple[Values, Coverage | None, str, int, int], side: int, portion: int) -> None:
+@given(picture=pictures(), side=st.sampled_from([16, 32]), portion=st.integers(1, 40), pad=st.integers(0, 5), clamp=st.booleans())
+@example(picture=(np.ones((1, 1, 1), np.float32), None, "height", 6, 5), side=16, portion=1, pad=0, clamp=False)
+def test_any_window_gives_the_bits_of_the_whole(
+    picture: tuple[Values, Coverage | None, str, int, int], side: int, portion: int, pad: int, clamp: bool
+) -> None:
     """No seams, by construction: every window, however small and however it is fed, sees its real neighbours."""
     values, coverage, kind, radius, levels = picture
     height, width = values.shape[:2]
-    whole = run_cascade(values, coverage, levels=levels, kind=kind, radius=radius)
+    whole = run_cascade(values, coverage, levels=levels, kind=kind, radius=radius, clamp=clamp)
     for y, x in product(range(0, height, side), range(0, width, side)):
         core = Rect(x, y, min(x + side, width), min(y + side, height))
-        parts = run_cascade(values, coverage, levels=levels, kind=kind, radius=radius, core=core, portion=portion)
+        parts = run_cascade(values, coverage, levels=levels, kind=kind, radius=radius, core=core, pad=pad, clamp=clamp, portion=portion)
         for (held, found, covered), (_, expected, expected_covered) in zip(parts, whole, strict=True):
             window = np.s_[held.y0 : held.y1, held.x0 : held.x1]
             assert found.tobytes() == expected[window].tobytes()
             if covered is not None and expected_covered is not None:
                 assert covered.tobytes() == expected_covered[window].tobytes()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("void_share", [0.0, 0.3])
+def test_clamp_keeps_samples_in_the_range_of_their_support(kind: str, void_share: float) -> None:
+    """Cliffs ring by 6 % of their height without it; the range is that of the valid samples under the taps, found by brute force."""
+    rng = np.random.default_rng(6)
+    values = np.where(rng.random((40, 50, 2)) < 0.5, 0, 1000).astype(np.float32)
+    coverage = (rng.random((40, 50)) >= void_share).astype(np.float32)
+    values[coverage == 0] = 0
+    plain, clamped = (
+        run_cascade(values, coverage if void_share else None, levels=2, kind=kind, radius=3, clamp=clamp)[1] for clamp in (False, True)
+    )
+    offsets, _ = blackman_sinc(3, KINDS[kind][0]).taps()
+    assert (plain[1].min(), plain[1].max()) != (clamped[1].min(), clamped[1].max()), "the input rings"
+    for j, i in np.ndindex(clamped[1].shape[:2]):
+        rows, columns = ([index for index in 2 * place + offsets if 0 <= index < size] for place, size in ((j, 40), (i, 50)))
+        support = values[np.ix_(rows, columns)][coverage[np.ix_(rows, columns)] > 0]
+        if len(support):
+            assert (clamped[1][j, i] == np.clip(plain[1][j, i], support.min(axis=0), support.max(axis=0))).all()
 
 
 @pytest.mark.parametrize("turn", [np.flipud, np.fliplr, lambda picture: picture.swapaxes(0, 1)])
