@@ -72,6 +72,7 @@ class Filter(Model):
     radius: int = Field(ge=1, description="Kernel radius [coarse samples]")
     edge: Literal["antisymmetric", "mirror"] = Field(description="What a filter sees beyond the source's edge")
     clamp: Clamp = Field(default="none", description="'local': coarse samples were kept in the range of the valid samples under their taps")
+    linear_light: bool = Field(default=False, description="Whether sRGB samples were decoded to light before and encoded after filtering")
     void: Literal["guarded-normalised"] = Field(
         default="guarded-normalised", description="How voids and alpha are weighed: normalised convolution with a guarded fallback"
     )
@@ -163,6 +164,7 @@ class Layer(Model):
         description="Ground distance between samples along a row and along a column at the layer's centre [m]; null if unknown"
     )
     filter: Filter = Field(description="How coarser levels are made")
+    fill: int = Field(default=0, ge=0, description="Voids up to this many samples across were filled before the pyramid was built")
     source: Source = Field(description="Where the layer came from")
     statistics: Statistics = Field(description="What level 0 holds")
     levels: list[Level] = Field(min_length=1, description="All levels, the finest first")

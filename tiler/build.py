@@ -19,15 +19,17 @@ from schemas.settings import BuildSettings
 from tiler.cascade import Cascade, Coverage, Values, held_windows
 from tiler.cut import Cutter, StageTimes, Target
 from tiler.engine import run_tasks
+from tiler.fill import FilledSource
 from tiler.ledger import Ledger
 from tiler.plan import Plan, plan_layer
 from tiler.rowfile import RowFile
-from tiler.sources.convert import Source, choose_conversion
+from tiler.sources.convert import SampleSource, Source, choose_conversion
 from tiler.sources.disguise import refuse_disguised_heights
 from tiler.sources.files import open_file
 from tiler.stores.dataset import read_manifest
 from tiler.stores.directory import DirectoryStore
 from tiler.tasks import Task, plan_tasks
+from tiler.transfer import LinearLight
 
 Progress = Callable[[int, int], None]
 """Called with (blocks finished, blocks in all), from any thread, one call at a time."""
@@ -66,7 +68,7 @@ def build_layer(path: Path, output: Path, settings: BuildSettings, on_progress: 
         reader = open_file(path, output)
         try:
             source = Source(reader, choose_conversion(reader.info, settings))
-            plan = plan_layer(source, dataset, settings)
+            plan = plan_layer(_prepared(source, settings), dataset, settings)
             if settings.decode is None:
                 refuse_disguised_heights(reader, source.conversion)
             manifest, times = _build(plan, store, dataset, output, on_progress)
@@ -81,6 +83,19 @@ def build_layer(path: Path, output: Path, settings: BuildSettings, on_progress: 
         megasamples=plan.lattice.width * plan.lattice.height / 1e6,
         peak_rss_bytes=_peak_rss_bytes(),
     )
+
+
+def _prepared(source: SampleSource, settings: BuildSettings) -> SampleSource:
+    """Wrap the source in what changes its samples before the pyramid is built; raises UsageError for the wrong kind of layer."""
+    if settings.fill:
+        if source.conversion.kind != "height":
+            raise UsageError("--fill is for heights; voids of imagery stay transparent")
+        source = FilledSource(source, settings.fill)
+    if settings.linear_light:
+        if source.conversion.kind != "imagery":
+            raise UsageError("--linear-light is for imagery; heights are linear already")
+        source = LinearLight(source)
+    return source
 
 
 def _peak_rss_bytes() -> int:
@@ -101,7 +116,7 @@ def _refuse_foreign(output: Path) -> None:
 def _build(
     plan: Plan, store: DirectoryStore, dataset: Manifest | None, scratch: Path, on_progress: Progress
 ) -> tuple[Manifest, StageTimes]:
-    target = Target(store, _unused_path(plan.name, dataset), plan.name, plan.lattice, plan.block, plan.codec)
+    target = Target(store, _unused_path(plan.name, dataset), plan.name, plan.lattice, plan.block, plan.codec, plan.linear_light)
     ledger = Ledger(plan.lattice, plan.source.conversion.channels, on_progress)
     store.delete_prefix(target.path)
     try:
@@ -145,7 +160,7 @@ class _Carried:
         return np.ascontiguousarray(rows[..., : self._channels]), np.ascontiguousarray(rows[..., self._channels])
 
 
-Samples = Source | _Carried
+Samples = SampleSource | _Carried
 
 
 def _run_tiers(plan: Plan, target: Target, ledger: Ledger, scratch: Path) -> StageTimes:
@@ -241,8 +256,15 @@ def _layer_entry(plan: Plan, target: Target, ledger: Ledger) -> Layer:
         max_error=plan.codec.max_error,
         transform=plan.placement.transform,
         ground_spacing_m=plan.placement.ground_spacing_m,
-        filter=Filter(kernel=kernel.name, radius=kernel.radius, edge=plan.recipe.edge, clamp="local" if plan.recipe.clamp else "none"),
+        filter=Filter(
+            kernel=kernel.name,
+            radius=kernel.radius,
+            edge=plan.recipe.edge,
+            clamp="local" if plan.recipe.clamp else "none",
+            linear_light=plan.linear_light,
+        ),
         source=_source_entry(plan),
+        fill=plan.fill,
         statistics=ledger.statistics(),
         levels=[ledger.level(level) for level in range(plan.lattice.levels)],
     )

@@ -17,6 +17,7 @@ from tiler.cascade import Coverage, Values
 from tiler.codecs import BlockFormat, Codec, Mask, Samples
 from tiler.measure import measure
 from tiler.stores import Store
+from tiler.transfer import encode_srgb
 
 
 @dataclass(slots=True)
@@ -57,23 +58,25 @@ class Target:
     lattice: Lattice
     block: BlockFormat
     codec: Codec
+    linear_light: bool = False
 
     def key(self, address: BlockAddress) -> str:
         """Return the store key of a block."""
         return block_key(self.path, self.name, address, self.lattice.levels, self.codec.suffix)
 
 
-def round_samples(values: Values, coverage: Coverage | None, block: BlockFormat) -> tuple[Samples, Mask | None]:
+def round_samples(values: Values, coverage: Coverage | None, block: BlockFormat, linear_light: bool = False) -> tuple[Samples, Mask | None]:
     """Round float32 ``values`` (rows, columns, channels) to the stored type, once, to nearest (ties to even), within its range.
 
     Coverage becomes the alpha channel of imagery, or the mask of heights (True where any of the sample is covered). Colour
-    under an alpha of 0 is set to 0.
+    under an alpha of 0 is set to 0. Values in ``linear_light`` are encoded as sRGB first.
     """
     if block.dtype == "float32":
         return values, None if coverage is None else coverage > 0
     dtype = np.dtype(block.dtype)
     top = np.iinfo(dtype).max
-    rounded = np.clip(np.rint(values), 0, top).astype(dtype)
+    codes = encode_srgb(values, top) if linear_light else values
+    rounded = np.clip(np.rint(codes), 0, top).astype(dtype)
     if not block.alpha:
         return rounded, None
     alpha = np.full(values.shape[:2], top, dtype) if coverage is None else np.rint(coverage * np.float32(top)).astype(dtype)
@@ -142,7 +145,7 @@ class Cutter:
         strip = self._strips.get(level)
         if strip is None:
             strip = self._strips[level] = _Strip(padded.y0, core.y0 // lattice.block)
-        strip.append(*round_samples(part, covered, self._target.block))
+        strip.append(*round_samples(part, covered, self._target.block, self._target.linear_light))
         self._cut_complete(level, strip, core, padded)
 
     def _cut_complete(self, level: int, strip: _Strip, core: Rect, padded: Rect) -> None:

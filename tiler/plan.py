@@ -15,7 +15,7 @@ from tiler.codecs import BlockFormat, Codec, open_codec
 from tiler.edges import EdgeRule
 from tiler.kernels import DESIGNS, FIXED_RADIUS
 from tiler.placement import Placement, place
-from tiler.sources.convert import Source
+from tiler.sources.convert import SampleSource
 from tiler.tasks import Tier, plan_tiers
 
 _MAX_BLOCKS: Final = 1 << 27
@@ -41,7 +41,7 @@ _DEFAULTS: Final[dict[LayerKind, _Defaults]] = {
 class Plan:
     """One layer to build: what is read, on which lattice, how it is filtered, encoded and placed, by how many threads."""
 
-    source: Source
+    source: SampleSource
     name: str
     lattice: Lattice
     recipe: Recipe
@@ -50,9 +50,11 @@ class Plan:
     placement: Placement
     tiers: tuple[Tier, ...]
     workers: int
+    linear_light: bool
+    fill: int
 
 
-def plan_layer(source: Source, dataset: Manifest | None, settings: BuildSettings) -> Plan:
+def plan_layer(source: SampleSource, dataset: Manifest | None, settings: BuildSettings) -> Plan:
     """Return the plan for the layer that ``source`` becomes beside those of ``dataset``.
 
     Raises UsageError if the layer is there already, its codec cannot hold it, or it does not go with the dataset.
@@ -86,10 +88,12 @@ def plan_layer(source: Source, dataset: Manifest | None, settings: BuildSettings
         placement=place(info, defaults.registration, settings.spacing, dataset, name),
         tiers=tuple(plan_tiers(lattice, settings.task)),
         workers=settings.workers or len(os.sched_getaffinity(0)),
+        linear_light=settings.linear_light,
+        fill=settings.fill,
     )
 
 
-def _codec_spec(source: Source, block: BlockFormat, settings: BuildSettings) -> str:
+def _codec_spec(source: SampleSource, block: BlockFormat, settings: BuildSettings) -> str:
     """Return the codec asked for, or: lerc for heights, jpeg for opaque 8-bit imagery, png for the rest."""
     if settings.codec == "png16" and source.conversion.decode is None and source.info.dtype.kind in "iu":
         return _png16_spec(source)
@@ -100,7 +104,7 @@ def _codec_spec(source: Source, block: BlockFormat, settings: BuildSettings) -> 
     return "png" if block.alpha or block.dtype != "uint8" else "jpeg"
 
 
-def _png16_spec(source: Source) -> str:
+def _png16_spec(source: SampleSource) -> str:
     """Fit 16 bits to what the source's integers can be, so that level 0 is stored without loss."""
     limits = np.iinfo(source.info.dtype)
     if limits.bits > 16:

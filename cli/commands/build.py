@@ -56,6 +56,8 @@ def _settings(options: dict[str, Any]) -> BuildSettings:
     help="local: no ringing; coarse samples stay in the range of those under their taps.",
 )
 @click.option("--pad", type=int, default=0, show_default=True, help="Stored border of every block, in samples, copied from its neighbours.")
+@click.option("--linear-light", is_flag=True, help="Filter sRGB imagery in linear light: fine patterns keep their brightness.")
+@click.option("--fill", type=int, default=0, metavar="SAMPLES", help="Fill voids of heights that are at most so many samples across.")
 @click.option("--spacing", type=float, help="Metres between samples, for a source without georeference.")
 @click.option("--height-scale", type=float, default=1.0, show_default=True, help="Metres per unit of the source.")
 @click.option("--height-offset", type=float, default=0.0, show_default=True, help="Metres added after scaling.")

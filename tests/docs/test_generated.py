@@ -64,7 +64,7 @@ def test_a_manifest_is_valid_under_the_schema(validator: Any) -> None:
         (("layers", "height", "transform"), [1.0, 0.0]),
         (("layers", "height", "levels"), []),
         (("layers", "height", "levels", 0, "stored"), -1),
-        (("layers", "height", "filter", "kernel"), "box"),
+        (("layers", "height", "filter", "kernel"), "sinc"),
     ],
     ids=str,
 )

@@ -125,11 +125,22 @@ def test_an_edit_that_fits_the_model_is_told_by_the_version() -> None:
     assert "version does not match the content" in refusal(json.dumps(raw).encode())
 
 
-@pytest.mark.parametrize("path", [path for path in leaves(CONTENT) if path[-1] != "void"], ids=lambda path: ".".join(map(str, path)))
+OPTIONAL = {"void", "clamp", "linear_light", "fill", "enhance"}
+"""Fields that say how a step was done that is left out by default; a manifest without them means the default."""
+
+
+@pytest.mark.parametrize("path", [path for path in leaves(CONTENT) if path[-1] not in OPTIONAL], ids=lambda path: ".".join(map(str, path)))
 def test_no_field_can_be_left_out(path: tuple[Any, ...]) -> None:
     raw = copy.deepcopy(CONTENT)
     del at(raw, path[:-1])[path[-1]]
     refusal(json.dumps(raw).encode())
+
+
+@pytest.mark.parametrize("path", [path for path in leaves(CONTENT) if path[-1] in OPTIONAL], ids=lambda path: ".".join(map(str, path)))
+def test_optional_fields_have_defaults(path: tuple[Any, ...]) -> None:
+    raw = copy.deepcopy(CONTENT)
+    del at(raw, path[:-1])[path[-1]]
+    assert parse_manifest(json.dumps(raw).encode(), "here") == make_manifest()
 
 
 def test_the_version_changes_with_blocks_and_names_but_not_with_the_generator() -> None:

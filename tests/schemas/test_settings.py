@@ -39,7 +39,7 @@ def test_settings_are_frozen(settings: BaseModel) -> None:
     "changes",
     [
         {"layer": "colour"},
-        {"filter": "lanczos"},
+        {"filter": "sinc"},
         {"radius": 0},
         {"radius": 17},
         {"workers": 0},
