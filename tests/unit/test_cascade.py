@@ -12,60 +12,15 @@ from numpy.typing import NDArray
 from schemas.lattice import Registration
 from schemas.manifest import KernelName
 from schemas.region import Rect
+from tests.levels import KINDS, run_cascade
 from tests.reference import kernels as reference_kernels
 from tests.reference import pyramid as reference
 from tests.reference.terrain import photo, terrain
-from tiler.cascade import Cascade, Coverage, Recipe, Values, held_windows
-from tiler.edges import EdgeRule
+from tiler.cascade import Coverage, Values
 from tiler.kernels import DESIGNS, FIXED_RADIUS, blackman_sinc, covering, frequency_response
-
-LevelRows = tuple[Rect, Values, Coverage | None]
-HEIGHT: tuple[Registration, EdgeRule] = ("point", "antisymmetric")
-IMAGERY: tuple[Registration, EdgeRule] = ("area", "mirror")
-KINDS = {"height": HEIGHT, "imagery": IMAGERY}
 
 # Float32 keeps 24 bits: one halving rounds three times (two passes and the reference sample of each).
 ULPS_PER_LEVEL = 4
-
-
-def run_cascade(
-    values: Values,
-    coverage: Coverage | None,
-    *,
-    levels: int,
-    kind: str = "height",
-    radius: int = 6,
-    core: Rect | None = None,
-    pad: int = 0,
-    clamp: bool = False,
-    portion: int = 1 << 30,
-) -> list[LevelRows]:
-    """Return (held window, values, coverage) of every level for one window of the whole picture."""
-    registration, edge = KINDS[kind]
-    height, width, channels = values.shape
-    kernel = blackman_sinc(radius, registration)
-    windows = held_windows((width, height), core or Rect(0, 0, width, height), [pad] * levels, kernel.reach)
-    rows: list[list[tuple[int, Values, Coverage | None]]] = [[] for _ in range(levels)]
-    cascade = Cascade(
-        (width, height),
-        windows,
-        channels,
-        Recipe(kernel, edge, coverage is not None, clamp),
-        lambda level, first, part, covered: rows[level].append((first, part.copy(), None if covered is None else covered.copy())),
-    )
-    whole = windows[0]
-    for y in range(whole.y0, whole.y1, portion):
-        rows_columns = np.s_[y : min(whole.y1, y + portion), whole.x0 : whole.x1]
-        covered = None if coverage is None else np.ascontiguousarray(coverage[rows_columns])
-        cascade.push(np.ascontiguousarray(values[rows_columns]), covered)
-    result: list[LevelRows] = []
-    for level, window in enumerate(windows):
-        firsts = [first for first, _, _ in rows[level]]
-        lengths = [len(part) for _, part, _ in rows[level]]
-        assert firsts == [window.y0 + sum(lengths[:index]) for index in range(len(lengths))], "rows come in order, without gaps"
-        coverages = [part for _, _, part in rows[level] if part is not None]
-        result.append((window, np.concatenate([part for _, part, _ in rows[level]]), np.concatenate(coverages) if coverages else None))
-    return result
 
 
 def assert_close(found: Values, expected: NDArray[np.float64], level: int, scale: float) -> None:

@@ -1,0 +1,1 @@
+uniform sampler2DArray u_surface;  // height in metres, validity
