@@ -3,10 +3,11 @@
 import numpy as np
 
 from schemas.lattice import Registration
+from schemas.manifest import KernelName
 from schemas.region import Rect
 from tiler.cascade import Cascade, Coverage, Recipe, Values, held_windows
 from tiler.edges import EdgeRule
-from tiler.kernels import blackman_sinc
+from tiler.kernels import DESIGNS
 
 LevelRows = tuple[Rect, Values, Coverage | None]
 HEIGHT: tuple[Registration, EdgeRule] = ("point", "antisymmetric")
@@ -24,12 +25,13 @@ def run_cascade(
     core: Rect | None = None,
     pad: int = 0,
     clamp: bool = False,
+    name: KernelName = "blackman-sinc",
     portion: int = 1 << 30,
 ) -> list[LevelRows]:
     """Return (held window, values, coverage) of every level for one window of the whole picture."""
     registration, edge = KINDS[kind]
     height, width, channels = values.shape
-    kernel = blackman_sinc(radius, registration)
+    kernel = DESIGNS[name](radius, registration)
     windows = held_windows((width, height), core or Rect(0, 0, width, height), [pad] * levels, kernel.reach)
     rows: list[list[tuple[int, Values, Coverage | None]]] = [[] for _ in range(levels)]
     cascade = Cascade(
