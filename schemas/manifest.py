@@ -165,6 +165,9 @@ class Layer(Model):
     )
     filter: Filter = Field(description="How coarser levels are made")
     fill: int = Field(default=0, ge=0, description="Voids up to this many samples across were filled before the pyramid was built")
+    enhance: str | None = Field(
+        default=None, description="How samples were enhanced before the pyramid was built, e.g. wavelet:1.5; null if they were not"
+    )
     source: Source = Field(description="Where the layer came from")
     statistics: Statistics = Field(description="What level 0 holds")
     levels: list[Level] = Field(min_length=1, description="All levels, the finest first")

@@ -30,6 +30,7 @@ class BuildSettings(Settings):
     clamp: Clamp = Field(default="none", description="'local' keeps coarse samples in the range of those under their taps: no ringing")
     linear_light: bool = Field(default=False, description="Filter sRGB imagery in linear light")
     fill: int = Field(default=0, ge=0, le=256, description="Fill voids of heights up to this many samples across")
+    enhance: str | None = Field(default=None, description="Enhancement of imagery before the pyramid is built, wavelet or wavelet:GAIN")
     task: int = Field(default=2048, ge=2, description="Side of a task [level-0 samples]; has no effect on the result")
     workers: int | None = Field(
         default=None, ge=1, le=256, description="Threads; default: the processors there are; has no effect on the result"

@@ -19,6 +19,7 @@ from schemas.settings import BuildSettings
 from tiler.cascade import Cascade, Coverage, Values, held_windows
 from tiler.cut import Cutter, StageTimes, Target
 from tiler.engine import run_tasks
+from tiler.enhance import EnhancedSource, parse_enhancement
 from tiler.fill import FilledSource
 from tiler.ledger import Ledger
 from tiler.plan import Plan, plan_layer
@@ -91,6 +92,8 @@ def _prepared(source: SampleSource, settings: BuildSettings) -> SampleSource:
         if source.conversion.kind != "height":
             raise UsageError("--fill is for heights; voids of imagery stay transparent")
         source = FilledSource(source, settings.fill)
+    if settings.enhance is not None:
+        source = EnhancedSource(source, parse_enhancement(settings.enhance))
     if settings.linear_light:
         if source.conversion.kind != "imagery":
             raise UsageError("--linear-light is for imagery; heights are linear already")
@@ -265,6 +268,7 @@ def _layer_entry(plan: Plan, target: Target, ledger: Ledger) -> Layer:
         ),
         source=_source_entry(plan),
         fill=plan.fill,
+        enhance=plan.enhance,
         statistics=ledger.statistics(),
         levels=[ledger.level(level) for level in range(plan.lattice.levels)],
     )

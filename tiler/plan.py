@@ -13,6 +13,7 @@ from schemas.settings import BuildSettings
 from tiler.cascade import Recipe
 from tiler.codecs import BlockFormat, Codec, open_codec
 from tiler.edges import EdgeRule
+from tiler.enhance import parse_enhancement
 from tiler.kernels import DESIGNS, FIXED_RADIUS
 from tiler.placement import Placement, place
 from tiler.sources.convert import SampleSource
@@ -52,6 +53,7 @@ class Plan:
     workers: int
     linear_light: bool
     fill: int
+    enhance: str | None
 
 
 def plan_layer(source: SampleSource, dataset: Manifest | None, settings: BuildSettings) -> Plan:
@@ -90,6 +92,7 @@ def plan_layer(source: SampleSource, dataset: Manifest | None, settings: BuildSe
         workers=settings.workers or len(os.sched_getaffinity(0)),
         linear_light=settings.linear_light,
         fill=settings.fill,
+        enhance=None if settings.enhance is None else parse_enhancement(settings.enhance).spec,
     )
 
 

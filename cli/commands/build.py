@@ -6,30 +6,10 @@ from pathlib import Path
 from typing import Any, get_args
 
 import click
-from pydantic import ValidationError
 
+from cli.options import build_settings, parse_bands
 from cli.output import emit_json, emit_pairs, format_bytes
-from schemas.errors import UsageError
 from schemas.manifest import KernelName
-from schemas.settings import BuildSettings
-
-
-def _bands(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, ...] | None:
-    if value is None:
-        return None
-    try:
-        return tuple(int(part) for part in value.split(","))
-    except ValueError:
-        raise click.BadParameter(f"{value!r}: channel numbers from 1, separated by commas, e.g. 1,2,3") from None
-
-
-def _settings(options: dict[str, Any]) -> BuildSettings:
-    try:
-        return BuildSettings(**options)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        option = "--" + str(first["loc"][0]).replace("_", "-") if first["loc"] else "options"
-        raise UsageError(f"{option}: {first['msg'].removeprefix('Value error, ')}") from error
 
 
 @click.command(short_help="Build a layer of a dataset from a source image or elevation model.")
@@ -57,6 +37,11 @@ def _settings(options: dict[str, Any]) -> BuildSettings:
 )
 @click.option("--pad", type=int, default=0, show_default=True, help="Stored border of every block, in samples, copied from its neighbours.")
 @click.option("--linear-light", is_flag=True, help="Filter sRGB imagery in linear light: fine patterns keep their brightness.")
+@click.option(
+    "--enhance",
+    metavar="wavelet[:GAIN]",
+    help="Amplify fine details of imagery before the pyramid is built; a gain of 1 changes nothing, 1.5 is usual.",
+)
 @click.option("--fill", type=int, default=0, metavar="SAMPLES", help="Fill voids of heights that are at most so many samples across.")
 @click.option("--spacing", type=float, help="Metres between samples, for a source without georeference.")
 @click.option("--height-scale", type=float, default=1.0, show_default=True, help="Metres per unit of the source.")
@@ -67,7 +52,7 @@ def _settings(options: dict[str, Any]) -> BuildSettings:
     help="Heights are hidden in the source's colours, in this way; none: it is a picture, even if it looks like hidden heights.",
 )
 @click.option("--nodata", type=float, help="Value that marks a void, instead of the one the file declares.")
-@click.option("--bands", callback=_bands, help="Channels to take, from 1, e.g. 1,2,3.")
+@click.option("--bands", callback=parse_bands, help="Channels to take, from 1, e.g. 1,2,3.")
 @click.option("--workers", type=int, help="Threads; no effect on the result.  [default: all processors]")
 @click.option("--task", type=int, default=2048, show_default=True, help="Side of a task in samples; no effect on the result.")
 @click.option("--overwrite", is_flag=True, help="Replace the layer if the dataset has it; the old one is served until the new one is done.")
@@ -83,7 +68,7 @@ def command(source: Path, output: Path, as_json: bool, **options: Any) -> None: 
     clipmap build photo.tif -o out/alps
     clipmap build height.png --layer height --height-scale 0.1 --spacing 160 -o out/puget
     """
-    settings = _settings(options)
+    settings = build_settings(options)
     from tiler.build import build_layer
 
     with _progress() as on_progress:
