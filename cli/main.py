@@ -12,9 +12,12 @@ from schemas.errors import ClipmapError
 
 COMMANDS: Final = {
     "build": "Build a layer of a dataset from a source image or elevation model.",
-    "inspect": "Show a dataset, a level or a block.",
+    "inspect": "Show a dataset, a level, a block or the values at a place.",
+    "verify": "Check a dataset: files, digests, samples, seams.",
+    "diff": "Compare two datasets: fields, blocks, samples.",
     "serve": "Serve datasets over HTTP.",
     "view": "Render a dataset, in a window or headless.",
+    "accuracy": "Measure what accuracy costs in time, on a source or a built-in terrain.",
     "demo": "Build, serve and render a built-in terrain.",
 }
 """Commands and their one-line help. Kept here so that ``clipmap --help`` imports none of them."""
@@ -58,7 +61,7 @@ def run(arguments: list[str] | None = None) -> int:
     except click.exceptions.Exit as stop:
         return stop.exit_code
     except click.ClickException as error:
-        error.show()
+        _show(error)
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
         click.echo("clipmap: interrupted", err=True)
@@ -70,6 +73,16 @@ def run(arguments: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return STORAGE
     return result if isinstance(result, int) else 0
+
+
+def _show(error: click.ClickException) -> None:
+    """Print a mistake on the command line as one sentence; no arguments at all are no mistake but a call for help."""
+    if isinstance(error, getattr(click.exceptions, "NoArgsIsHelpError", ())):  # since click 8.2
+        error.show()
+        return
+    context = getattr(error, "ctx", None)
+    hint = "" if context is None else f" (see {context.command_path} --help)"
+    click.echo(f"clipmap: {error.format_message().rstrip('.')}{hint}", err=True)
 
 
 def main() -> None:

@@ -2,7 +2,8 @@
 
 import numpy as np
 from geographiclib.geodesic import Geodesic
-from rasterio.errors import RasterioError
+from rasterio._err import CPLE_BaseError
+from rasterio.errors import CRSError, RasterioError
 from rasterio.warp import transform as reproject
 
 from schemas.manifest import Transform
@@ -21,7 +22,8 @@ def ground_spacing_m(transform: Transform, crs: str | None, column: float, row: 
     rows = np.array([row, row, row - 0.5, row + 0.5])
     try:
         longitudes, latitudes = reproject(crs, "EPSG:4326", (a * columns + b * rows + c).tolist(), (d * columns + e * rows + f).tolist())
-    except RasterioError:
+    except (RasterioError, CRSError, CPLE_BaseError):
+        # Unknown here, local (a quarry's own axes), or outside of what the projection can be inverted for.
         return None
     if not np.isfinite([*longitudes, *latitudes]).all() or max(map(abs, latitudes)) > 90:
         return None

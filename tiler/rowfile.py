@@ -68,10 +68,16 @@ class RowFile:
             return self._memory[window.y0 : window.y1, window.x0 : window.x1]
         pixels = np.empty((window.height, window.width, self._shape[2]), self._dtype)
         for row in range(window.height):
-            line = pixels[row].view(np.uint8).reshape(-1)
-            if os.preadv(self._file, [line], self._offset(window.x0, window.y0 + row)) != line.size:
-                raise StorageError(f"scratch file in {self._folder}: shorter than what was written")
+            self._read_bytes(pixels[row].view(np.uint8).reshape(-1).data, self._offset(window.x0, window.y0 + row))
         return pixels
+
+    def _read_bytes(self, line: memoryview, offset: int) -> None:
+        try:
+            found = os.preadv(self._file, [line], offset)
+        except OSError as error:
+            raise StorageError(f"scratch file in {self._folder}: cannot be read: {error.strerror}") from error
+        if found != line.nbytes:
+            raise StorageError(f"scratch file in {self._folder}: shorter than what was written")
 
     def close(self) -> None:
         """Free the memory or the file."""

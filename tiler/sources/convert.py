@@ -5,7 +5,7 @@ reach any result.
 """
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,33 @@ class Conversion:
     def channels(self) -> int:
         """Channels of a sample, alpha not counted."""
         return 1 if self.decode else len(self.colours)
+
+
+class SampleSource(Protocol):
+    """Windows of the samples of one layer, from any thread; wrappers change samples on their way."""
+
+    @property
+    def info(self) -> FileInfo:
+        """What the file declares."""
+        ...
+
+    @property
+    def conversion(self) -> Conversion:
+        """How the file becomes a layer."""
+        ...
+
+    @property
+    def masked(self) -> bool:
+        """Whether samples may be void or transparent."""
+        ...
+
+    def read(self, window: Rect) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """Return samples (rows, columns, channels) and coverage (rows, columns), None unless ``masked``."""
+        ...
+
+    def close(self) -> None:
+        """Close the file."""
+        ...
 
 
 class Source:
@@ -91,16 +118,15 @@ class Source:
             and np.abs(colours.astype(np.float64)).max(initial=0) > _EXACT_INTEGERS
         ):
             raise InputError(f"{self.info.path}: whole numbers beyond {_EXACT_INTEGERS} would be rounded; scale the file down first")
-        if conversion.decode:
-            return _decoded(colours, conversion)
-        if (conversion.scale, conversion.offset) != (1.0, 0.0):
-            values = (colours.astype(np.float64) * conversion.scale + conversion.offset).astype(np.float32)
-        else:
-            values = np.ascontiguousarray(colours, np.float32)
-        if coverage is not None and (conversion.scale, conversion.offset) != (1.0, 0.0):
+        exact = conversion.decode is None and (conversion.scale, conversion.offset) == (1.0, 0.0)
+        with np.errstate(over="ignore", under="ignore"):
+            values = np.ascontiguousarray(colours, np.float32) if exact else _in_metres(colours, conversion)
+            if conversion.premultiplied and coverage is not None:
+                np.divide(values, coverage[..., np.newaxis], out=values, where=coverage[..., np.newaxis] > 0)
+        if not exact and coverage is not None:
             values[coverage == 0] = 0
-        if conversion.premultiplied and coverage is not None:
-            np.divide(values, coverage[..., np.newaxis], out=values, where=coverage[..., np.newaxis] > 0)
+        if (not exact or colours.dtype == np.float64 or conversion.premultiplied) and not np.isfinite(values).all():
+            raise InputError(f"{self.info.path}: values beyond the range of float32; if they mark voids, say so with --nodata")
         return values
 
 
@@ -111,17 +137,21 @@ def _chosen(pixels: Pixels, channels: tuple[int, ...]) -> Pixels:
 
 
 def _in_dtype(value: float, dtype: np.dtype[Any]) -> float:
-    return float(dtype.type(value)) if dtype.kind == "f" else value
+    with np.errstate(under="ignore"):
+        return float(dtype.type(value)) if dtype.kind == "f" else value
 
 
-def _decoded(colours: Pixels, conversion: Conversion) -> NDArray[np.float32]:
+def _in_metres(colours: Pixels, conversion: Conversion) -> NDArray[np.float32]:
+    units = _decoded(colours, conversion.decode) if conversion.decode else colours.astype(np.float64)
+    return (units * conversion.scale + conversion.offset).astype(np.float32)
+
+
+def _decoded(colours: Pixels, encoding: HeightEncoding) -> NDArray[np.float64]:
     """Return heights from colour: terrarium R*256 + G + B/256 - 32768, terrain-RGB -10000 + (R*65536 + G*256 + B) / 10 [m]."""
     red, green, blue = (colours[..., channel].astype(np.float64) for channel in range(3))
-    if conversion.decode == "terrarium":
-        heights = red * 256 + green + blue / 256 - 32768
-    else:
-        heights = (red * 65536 + green * 256 + blue) / 10 - 10000
-    return (heights * conversion.scale + conversion.offset).astype(np.float32)[..., np.newaxis]
+    if encoding == "terrarium":
+        return (red * 256 + green + blue / 256 - 32768)[..., np.newaxis]
+    return ((red * 65536 + green * 256 + blue) / 10 - 10000)[..., np.newaxis]
 
 
 def choose_conversion(info: FileInfo, settings: BuildSettings) -> Conversion:
@@ -134,18 +164,19 @@ def choose_conversion(info: FileInfo, settings: BuildSettings) -> Conversion:
         raise UsageError(f"{info.path}: no channel {max(chosen) + 1}, it has {info.channels}; correct --bands")
     alpha = info.alpha if settings.bands is None or info.alpha in chosen else None
     colours = tuple(channel for channel in chosen if channel != alpha)
-    kind = settings.layer or _guessed_kind(info, colours)
+    decode = None if settings.decode == "none" else settings.decode
+    kind = settings.layer or ("height" if decode else _guessed_kind(info, colours))
     if kind == "height":
-        _check_height(info, colours, settings)
+        _check_height(info, colours, decode)
     else:
         _check_imagery(info, colours, settings)
     return Conversion(
         kind=kind,
-        colours=colours[:3] if settings.decode else colours,
+        colours=colours,
         alpha=alpha,
         premultiplied=info.premultiplied and alpha is not None,
         nodata=_nodata(info, settings),
-        decode=settings.decode,
+        decode=decode,
         scale=settings.height_scale if kind == "height" else 1.0,
         offset=settings.height_offset if kind == "height" else 0.0,
     )
@@ -163,10 +194,10 @@ def _guessed_kind(info: FileInfo, colours: tuple[int, ...]) -> LayerKind:
     )
 
 
-def _check_height(info: FileInfo, colours: tuple[int, ...], settings: BuildSettings) -> None:
-    if settings.decode:
+def _check_height(info: FileInfo, colours: tuple[int, ...], decode: HeightEncoding | None) -> None:
+    if decode:
         if len(colours) != 3 or info.dtype != np.uint8:
-            raise InputError(f"{info.path}: --decode {settings.decode} needs 3 channels of uint8, not {len(colours)} of {info.dtype}")
+            raise InputError(f"{info.path}: --decode {decode} needs 3 channels of uint8, not {len(colours)} of {info.dtype}")
     elif len(colours) != 1:
         raise InputError(
             f"{info.path}: heights have one channel, this has {len(colours)}; give --decode terrain-rgb or --decode terrarium "
@@ -177,7 +208,7 @@ def _check_height(info: FileInfo, colours: tuple[int, ...], settings: BuildSetti
 
 
 def _check_imagery(info: FileInfo, colours: tuple[int, ...], settings: BuildSettings) -> None:
-    if settings.decode or (settings.height_scale, settings.height_offset) != (1.0, 0.0):
+    if settings.decode not in (None, "none") or (settings.height_scale, settings.height_offset) != (1.0, 0.0):
         raise UsageError("--decode, --height-scale and --height-offset are for heights; add --layer height or leave them out")
     if info.dtype not in (np.uint8, np.uint16):
         raise InputError(
@@ -192,11 +223,19 @@ def _check_imagery(info: FileInfo, colours: tuple[int, ...], settings: BuildSett
 
 
 def _nodata(info: FileInfo, settings: BuildSettings) -> float | None:
-    """Return the value that marks voids, None if there is none or no sample of the file's type can have it."""
+    """Return the value that marks voids, None if there is none or no sample of the file's type can have it.
+
+    A declared value beyond a float type's range stands for the end of that range, which is what its writer was left with.
+    """
     value = info.nodata if settings.nodata is None else settings.nodata
     if value is None or not np.isfinite(value):
         return None
     if info.dtype.kind == "f":
-        return value
+        largest = float(np.finfo(info.dtype).max)
+        return min(max(value, -largest), largest)
     limits = np.iinfo(info.dtype)
-    return value if value == int(value) and limits.min <= value <= limits.max else None
+    if value == int(value) and limits.min <= value <= limits.max:
+        return value
+    if settings.nodata is not None:
+        raise UsageError(f"{info.path}: --nodata {value:g} marks nothing, no sample of {info.dtype} can have that value")
+    return None

@@ -20,7 +20,7 @@ _BETTER_WITH_RASTERIO = {"jpeg2000", "JP2OpenJPEG", "JP2KAK", "JP2ECW"}
 _SHARED_COMPRESSIONS = {None, "LZW", "DEFLATE", "PACKBITS", "JPEG", "CCITTRLE", "CCITTFAX3", "CCITTFAX4"}
 """Compressions of TIFF that OpenImageIO decodes as well as GDAL. It lacks the newer ones (ZSTD, LERC, ...), and leaves the missing
 parts of "YCbCr JPEG" black without an error."""
-_PICTURE_DRIVERS = {"PNG", "JPEG", "GIF", "BMP"}
+_PICTURE_DRIVERS = {"PNG", "JPEG", "GIF", "BMP", "TGA"}
 """GDAL drivers for formats of which OpenImageIO has the last word: it notices truncation."""
 
 
@@ -34,11 +34,12 @@ def open_file(path: Path, scratch: Path) -> Reader:
     geographic = geo.describe(path)
     if geographic is not None:
         _check_declared_size(geographic)
+        _check_complete(geographic)
         if geographic.format in _BETTER_WITH_RASTERIO:
             return RasterioReader(geographic)
     try:
         picture = oiio.describe(path)
-    except InputError as error:
+    except oiio.UnopenedError as error:
         if geographic is None:
             raise InputError(f"{error}; neither OpenImageIO nor GDAL can read it") from error
         if geographic.format in _PICTURE_DRIVERS:
@@ -89,6 +90,15 @@ def _located(picture: FileInfo, geographic: FileInfo) -> FileInfo:
 
 def _windowed(reader: Reader, scratch: Path) -> Reader:
     return SpooledReader(reader, scratch) if reader.info.layout == "sequential" else reader
+
+
+def _check_complete(info: FileInfo) -> None:
+    """Refuse a cut-off file of plain numbers: GDAL reads what is missing as zeros and says nothing."""
+    with info.path.open("rb") as file:
+        plain = info.format == "ENVI" or (info.format == "netCDF" and file.read(3) == b"CDF")
+    declared = info.width * info.height * info.channels * info.dtype.itemsize
+    if plain and info.file_bytes < declared:
+        raise InputError(f"{info.path}: has {info.file_bytes} bytes, but its samples alone take {declared}; the file is cut off")
 
 
 def _check_declared_size(info: FileInfo) -> None:

@@ -11,16 +11,18 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio._err import CPLE_BaseError
 from rasterio.enums import ColorInterp, MaskFlags
-from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.errors import CRSError, NotGeoreferencedWarning, RasterioError
 from rasterio.windows import Window
 
 from schemas.errors import InputError
 from schemas.region import Rect
 from tiler.sources import FileInfo, Georeference, Layout, Pixels
 
-_UNITS = {"metre": "metre", "meter": "metre", "m": "metre", "foot": "foot", "us survey foot": "us-foot"}
+_UNITS = {"degree": "degree", "metre": "metre", "meter": "metre", "m": "metre", "foot": "foot", "us survey foot": "us-foot"}
 _FAILURES = (RasterioError, CPLE_BaseError, MemoryError)
 """What rasterio raises on damaged files; where it reads more than pixels, GDAL's own errors come through as they are."""
+_OPENING = threading.Lock()
+"""Filters of warnings belong to the process: two threads that change and restore them would let one through, or lose one."""
 _WHOLE_IMAGE_DRIVERS = {"PNG", "JPEG", "GIF", "BMP", "WEBP"}
 """Drivers whose files can only be decoded from top to bottom."""
 
@@ -28,7 +30,7 @@ _WHOLE_IMAGE_DRIVERS = {"PNG", "JPEG", "GIF", "BMP", "WEBP"}
 def _open(path: Path) -> Any:  # noqa: ANN401 - rasterio has no types
     # Without a handler Python prints GDAL's own messages to stderr; ours say the same in one sentence.
     logging.getLogger("rasterio").addHandler(logging.NullHandler())
-    with warnings.catch_warnings():
+    with _OPENING, warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         return rasterio.open(path)
 
@@ -38,6 +40,8 @@ def describe(path: Path) -> FileInfo | None:
     try:
         with _open(path) as dataset:
             return _info(path, dataset)
+    except CRSError as error:
+        raise InputError(f"{path}: its coordinate reference system cannot be understood; repair it with gdal_edit.py -a_srs") from error
     except _FAILURES:
         return None
 
@@ -49,7 +53,6 @@ def _info(path: Path, dataset: Any) -> FileInfo | None:  # noqa: ANN401
         raise InputError(f"{path}: channels of different types ({', '.join(dataset.dtypes)}); choose with gdal_translate -b")
     flags = dataset.mask_flag_enums[0]
     block_rows, block_columns = dataset.block_shapes[0]
-    structure = dataset.tags(ns="IMAGE_STRUCTURE")
     alphas = [channel for channel, meaning in enumerate(dataset.colorinterp) if meaning == ColorInterp.alpha]
     layout: Layout = "tiled" if block_columns < dataset.width or block_rows >= dataset.height else "striped"
     return FileInfo(
@@ -63,10 +66,9 @@ def _info(path: Path, dataset: Any) -> FileInfo | None:  # noqa: ANN401
         layout="sequential" if dataset.driver in _WHOLE_IMAGE_DRIVERS else layout,
         chunk_rows=int(block_rows),
         alpha=alphas[0] if alphas else None,
-        premultiplied=bool(alphas) and structure.get("ALPHA") == "PREMULTIPLIED",
         nodata=None if dataset.nodata is None else float(dataset.nodata),
         has_mask=MaskFlags.per_dataset in flags and MaskFlags.alpha not in flags,
-        compression=structure.get("COMPRESSION"),
+        compression=dataset.tags(ns="IMAGE_STRUCTURE").get("COMPRESSION"),
         georeference=_georeference(dataset),
     )
 
@@ -75,12 +77,14 @@ def _georeference(dataset: Any) -> Georeference | None:  # noqa: ANN401
     transform = dataset.transform
     if dataset.crs is None and transform.is_identity:
         return None
+    if dataset.driver == "PNM" and len(dataset.files) == 1:
+        return None  # GDAL 3.10 gives uninitialised numbers for a portable pixmap without a world file
     crs, unit = dataset.crs, "unknown"
     name = None
     if crs is not None:
         authority = crs.to_authority()
         name = ":".join(authority) if authority else crs.to_wkt()
-        unit = "degree" if crs.is_geographic else _UNITS.get(str(crs.linear_units).lower(), "unknown")
+        unit = _UNITS.get(str(crs.units_factor[0]).lower(), "unknown")
     a, b, c, d, e, f = (float(value) for value in tuple(transform)[:6])
     if not np.isfinite([a, b, c, d, e, f]).all() or a * e - b * d == 0:
         raise InputError(f"{dataset.name}: the georeference is degenerate (a pixel has no area); repair it with gdal_edit.py -a_ullr")
@@ -124,11 +128,11 @@ class RasterioReader:
         return mask
 
     def _unreadable(self, window: Rect, error: BaseException) -> InputError:
-        # rasterio says "Read failed. See previous exception for details."
-        reason = str(error.__cause__ or error).strip().splitlines()
-        return InputError(
-            f"{self.info.path}: cannot be read at rows {window.y0} to {window.y1}: {reason[0] if reason else 'no reason given'}"
-        )
+        # rasterio says no more than "Read failed": the first cause of the chain is GDAL's own word.
+        while error.__cause__ is not None:
+            error = error.__cause__
+        reason = " ".join(str(error).split()) or "no reason given"
+        return InputError(f"{self.info.path}: cannot be read at rows {window.y0} to {window.y1}: {reason}")
 
     def close(self) -> None:
         """Close the handles of all threads."""

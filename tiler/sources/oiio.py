@@ -19,6 +19,10 @@ _STRIP_LIMIT_BYTES = 64 << 20
 """A strip larger than this is decoded once, from top to bottom, instead of again for each window."""
 
 
+class UnopenedError(InputError):
+    """OpenImageIO has no reader for the file, or its reader can make nothing of it."""
+
+
 def _open(path: Path) -> OpenImageIO.ImageInput:
     # OpenImageIO refuses files that declare more than its limit (32 GiB by default), which is what clipmap is for.
     OpenImageIO.attribute("limits:imagesize_MB", 2**31 - 1)
@@ -26,7 +30,7 @@ def _open(path: Path) -> OpenImageIO.ImageInput:
     config.attribute("oiio:UnassociatedAlpha", 1)
     handle = OpenImageIO.ImageInput.open(str(path), config)
     if handle is None:
-        raise InputError(f"{path}: {_first_line(OpenImageIO.geterror())}")
+        raise UnopenedError(f"{path}: {_first_line(OpenImageIO.geterror())}")
     return handle
 
 
@@ -36,7 +40,7 @@ def _first_line(message: str) -> str:
 
 
 def describe(path: Path) -> FileInfo:
-    """Return what OpenImageIO reads from the header; raises InputError with its reason if it cannot."""
+    """Return what OpenImageIO reads from the header; raises UnopenedError if it cannot, InputError if the file is no use."""
     handle = _open(path)
     spec = handle.spec()
     name = str(handle.format_name())

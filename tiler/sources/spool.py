@@ -3,6 +3,7 @@
 import contextlib
 import os
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,18 +17,37 @@ from tiler.sources import FileInfo, Pixels, Reader
 _PORTION_BYTES = 8 << 20
 
 
-@contextlib.contextmanager
-def _c_libraries_silenced() -> Iterator[None]:
-    """Keep libpng's and libjpeg's own words off stderr: the error we raise says the same in one sentence."""
-    sys.stderr.flush()
-    saved = os.dup(2)
-    try:
-        with open(os.devnull, "wb") as sink:
-            os.dup2(sink.fileno(), 2)
+class _Silence:
+    """Keeps libpng's and libjpeg's own words off stderr: the error we raise says the same in one sentence.
+
+    Descriptors belong to the process: the first thread in turns stderr away, the last one out turns it back.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._threads = 0
+        self._saved = -1
+
+    @contextlib.contextmanager
+    def __call__(self) -> Iterator[None]:
+        with self._lock:
+            if self._threads == 0:
+                sys.stderr.flush()
+                self._saved = os.dup(2)
+                with open(os.devnull, "wb") as sink:
+                    os.dup2(sink.fileno(), 2)
+            self._threads += 1
+        try:
             yield
-    finally:
-        os.dup2(saved, 2)
-        os.close(saved)
+        finally:
+            with self._lock:
+                self._threads -= 1
+                if self._threads == 0:
+                    os.dup2(self._saved, 2)
+                    os.close(self._saved)
+
+
+_c_libraries_silenced = _Silence()
 
 
 class SpooledReader:

@@ -105,6 +105,7 @@ class DirectoryStore:
         """
         path = self._root / _LOCK
         try:
+            made = [folder for folder in (self._root, *self._root.parents) if not folder.exists()]
             self._root.mkdir(parents=True, exist_ok=True)
             abandoned = path.exists()
             descriptor = self._locked(path)
@@ -116,7 +117,8 @@ class DirectoryStore:
             path.unlink(missing_ok=True)
             os.close(descriptor)
             with suppress(OSError):
-                self._root.rmdir()
+                for folder in made:
+                    folder.rmdir()
 
     def _locked(self, path: Path) -> int:
         while True:
