@@ -1,7 +1,5 @@
 """``clipmap build``: one source file becomes one layer of a dataset."""
 
-import sys
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, get_args
 
@@ -9,7 +7,9 @@ import click
 
 from cli.options import build_settings, parse_bands
 from cli.output import emit_json, emit_pairs, format_bytes
+from cli.progress import progress_bar
 from schemas.manifest import KernelName
+from schemas.settings import MAX_SAMPLES
 
 
 @click.command(short_help="Build a layer of a dataset from a source image or elevation model.")
@@ -42,6 +42,11 @@ from schemas.manifest import KernelName
     metavar="wavelet[:GAIN]",
     help="Amplify fine details of imagery before the pyramid is built; a gain of 1 changes nothing, 1.5 is usual.",
 )
+@click.option(
+    "--stretch",
+    metavar="CUT%|MIN,MAX",
+    help="Make 8 bits of 16-bit imagery: 2% cuts so much off both ends of every colour channel; MIN,MAX is one range for all.",
+)
 @click.option("--fill", type=int, default=0, metavar="SAMPLES", help="Fill voids of heights that are at most so many samples across.")
 @click.option("--spacing", type=float, help="Metres between samples, for a source without georeference.")
 @click.option("--height-scale", type=float, default=1.0, show_default=True, help="Metres per unit of the source.")
@@ -53,6 +58,13 @@ from schemas.manifest import KernelName
 )
 @click.option("--nodata", type=float, help="Value that marks a void, instead of the one the file declares.")
 @click.option("--bands", callback=parse_bands, help="Channels to take, from 1, e.g. 1,2,3.")
+@click.option(
+    "--max-samples",
+    type=int,
+    default=MAX_SAMPLES,
+    show_default=True,
+    help="Refuse a source whose header declares more samples, all channels counted.",
+)
 @click.option("--workers", type=int, help="Threads; no effect on the result.  [default: all processors]")
 @click.option("--task", type=int, default=2048, show_default=True, help="Side of a task in samples; no effect on the result.")
 @click.option("--overwrite", is_flag=True, help="Replace the layer if the dataset has it; the old one is served until the new one is done.")
@@ -71,7 +83,7 @@ def command(source: Path, output: Path, as_json: bool, **options: Any) -> None: 
     settings = build_settings(options)
     from tiler.build import build_layer
 
-    with _progress() as on_progress:
+    with progress_bar("blocks") as on_progress:
         report = build_layer(source, output, settings, on_progress)
     layer = report.manifest.layers[report.layer]
     seconds_per_megasample = {
@@ -109,12 +121,3 @@ def command(source: Path, output: Path, as_json: bool, **options: Any) -> None: 
             ("ms/Msample", stages),
         ]
     )
-
-
-def _progress() -> AbstractContextManager[Any]:
-    """Return a progress bar on a terminal, silence elsewhere."""
-    if not sys.stderr.isatty():
-        return nullcontext(lambda done, total: None)
-    from cli.progress import progress_bar
-
-    return progress_bar("blocks")

@@ -1,5 +1,6 @@
 """From a file's pixels to samples: guesses, voids, alpha, heights hidden in colour."""
 
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -240,11 +241,89 @@ def test_whole_numbers_that_float32_cannot_hold_are_refused() -> None:
 
 @pytest.mark.parametrize(
     ("dtype", "value", "settings"),
-    [("float64", 1e300, {}), ("float64", -1.7976931348623157e308, {}), ("float32", 3e38, {"height_scale": 10.0})],
+    [("float64", 1e30, {"height_scale": 1e9}), ("float32", -9e29, {"height_scale": 1e9}), ("float32", 0, {"height_offset": 1e39})],
 )
 def test_values_beyond_float32_are_refused(dtype: str, value: float, settings: dict[str, float]) -> None:
     with pytest.raises(InputError, match="beyond the range of float32; if they mark voids, say so with --nodata"):
         converted(MemoryReader(row(1, value, dtype=dtype)), **settings)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "value", "said"),
+    [
+        ("float32", 3.4028234663852886e38, "3.4028235e+38"),
+        ("float32", FLOAT_LOWEST, "-3.4028235e+38"),
+        ("float32", 1.70141e38, "1.70141e+38"),
+        ("float32", -1e32, "-1e+32"),
+        ("float64", -1.7976931348623157e308, "-1.7976931348623157e+308"),
+        ("float64", 1e300, "1e+300"),
+    ],
+)
+def test_c23_a_float_that_is_no_height_is_refused_until_it_is_given_as_nodata(dtype: str, value: float, said: str) -> None:
+    """The value is told so that it can be copied, and then marks the same samples."""
+    pixels = row(100, value, 300, dtype=dtype)
+    with pytest.raises(InputError, match="is no height; if it marks voids, give --nodata") as caught:
+        converted(MemoryReader(pixels))
+    assert str(caught.value) == f"dem.tif: {said} is no height; if it marks voids, give --nodata {said}"
+    values, coverage = converted(MemoryReader(pixels), nodata=float(said))
+    assert values[0, :, 0].tolist() == [100, 0, 300]
+    assert coverage is not None
+    assert coverage.tolist() == [[1, 0, 1]]
+    masked, _ = converted(MemoryReader(pixels, np.array([[255, 0, 255]], np.uint8)))
+    assert masked[0, :, 0].tolist() == [100, 0, 300]
+
+
+@pytest.mark.parametrize("value", [9.9e29, -9.9e29])
+def test_a_float_that_is_still_a_height(value: float) -> None:
+    assert converted(MemoryReader(row(0, value, dtype="float32")))[0][0, 1, 0] == np.float32(value)
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float32", "float64"])
+@pytest.mark.parametrize("settings", [{}, {"height_scale": 2.0}, {"height_scale": -2.0}])
+def test_c22_negative_zero_becomes_zero(dtype: str, settings: dict[str, float]) -> None:
+    values, _ = converted(MemoryReader(row(-0.0, 0.0, 3, -3, dtype=dtype)), **settings)
+    assert not np.signbit(values[0, :2, 0]).any()
+    assert values[0, 2:, 0].tolist() == [3 * settings.get("height_scale", 1), -3 * settings.get("height_scale", 1)]
+
+
+def test_a_float64_too_small_for_float32_becomes_zero_without_sign() -> None:
+    values, _ = converted(MemoryReader(row(-1e-300, dtype="float64")))
+    assert values.tobytes() == bytes(4)
+
+
+@pytest.mark.parametrize("bits", [9, 10, 12, 14, 15])
+def test_imagery_of_few_bits_is_scaled_to_all_of_its_type(bits: int) -> None:
+    """To n * 65535 / (2**bits - 1), rounded to float32 here and to a whole number when it is stored."""
+    top = 2**bits - 1
+    numbers = np.arange(top + 1, dtype=np.uint16).reshape(1, -1, 1)
+    values, _ = converted(MemoryReader(numbers, bits=bits), layer="imagery")
+    exact = [Fraction(n * 65535, top) for n in range(top + 1)]
+    assert all(abs(Fraction(float(found)) - wanted) <= wanted / 2**24 for found, wanted in zip(values[0, :, 0], exact, strict=True))
+    heights, _ = converted(MemoryReader(numbers, bits=bits), layer="height")
+    np.testing.assert_array_equal(heights, numbers)
+
+
+def test_alpha_and_nodata_of_few_bits_are_numbers_of_the_file() -> None:
+    pixels = np.array([[[4095, 1000, 0, 4095], [4095, 0, 0, 0], [7, 7, 7, 4095], [0, 0, 0, 819]]], np.uint16)
+    values, coverage = converted(MemoryReader(pixels, bits=12, alpha=3, nodata=7))
+    assert coverage is not None
+    assert coverage[0] == pytest.approx([1, 0, 0, 0.2])
+    assert values[0, :, 0].tolist() == [65535, 0, 0, 0]
+    assert values[0, 0, 1] == pytest.approx(1000 * 65535 / 4095)
+
+
+@pytest.mark.parametrize(
+    ("found", "settings", "sentence"),
+    [
+        (info(3, "uint8"), {}, "8 bits already"),
+        (info(1, "uint16"), {"layer": "height"}, "--stretch is for imagery"),
+        (info(1, "float32"), {}, "--stretch is for imagery"),
+        (info(3, "uint8"), {"decode": "terrarium"}, "--stretch is for imagery"),
+    ],
+)
+def test_what_cannot_be_stretched(found: FileInfo, settings: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(UsageError, match=sentence):
+        choose_conversion(found, BuildSettings(stretch="2%", **settings))
 
 
 def test_int16_heights_are_exact() -> None:

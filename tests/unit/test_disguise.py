@@ -104,7 +104,7 @@ def test_hidden_heights_are_refused_before_they_become_imagery() -> None:
 def test_what_cannot_be_hidden_heights_is_not_read() -> None:
     reader = MemoryReader(np.zeros((300, 300, 3), np.uint16))
     refuse_disguised_heights(reader, choose_conversion(reader.info, BuildSettings()))
-    conversion = Conversion("height", (0, 1, 2), None, False, None, "terrarium", 1.0, 0.0)
+    conversion = Conversion("height", (0, 1, 2), None, False, None, "terrarium", 1.0, 0.0, "float32")
     for kept in (conversion, replace(conversion, kind="imagery", colours=(0,), decode=None)):
         refuse_disguised_heights(reader, kept)
     assert not reader.windows

@@ -41,7 +41,7 @@ class ArraySource:
 
     values: Float32
     coverage: Float32 | None = None
-    dtype: str = "uint8"
+    dtype: Any = "uint8"
     kind: Any = "imagery"
     chunk_rows: int = 16
     masked: bool = field(init=False)
@@ -53,7 +53,7 @@ class ArraySource:
         rows, columns, channels = self.values.shape
         self.masked = self.coverage is not None
         self.info = FileInfo(Path("array"), "array", columns, rows, channels, np.dtype(self.dtype), 1, "tiled", self.chunk_rows)
-        self.conversion = Conversion(self.kind, tuple(range(channels)), None, False, None, None, 1.0, 0.0)
+        self.conversion = Conversion(self.kind, tuple(range(channels)), None, False, None, None, 1.0, 0.0, self.dtype)
 
     def read(self, window: Rect) -> tuple[Float32, Float32 | None]:
         assert window & self.info.rect == window, "inside the file"

@@ -30,7 +30,7 @@ class ArraySource:
 
     values: Float32
     coverage: Float32 | None
-    dtype: str = "float32"
+    dtype: Any = "float32"
     masked: bool = True
     info: FileInfo = field(init=False)
     conversion: Conversion = field(init=False)
@@ -38,7 +38,7 @@ class ArraySource:
     def __post_init__(self) -> None:
         rows, columns, channels = self.values.shape
         self.info = FileInfo(Path("array"), "array", columns, rows, channels, np.dtype(self.dtype), 1, "tiled", 1)
-        self.conversion = Conversion("height", tuple(range(channels)), None, False, None, None, 1.0, 0.0)
+        self.conversion = Conversion("height", tuple(range(channels)), None, False, None, None, 1.0, 0.0, self.dtype)
 
     def read(self, window: Rect) -> tuple[Float32, Float32 | None]:
         part = np.s_[window.y0 : window.y1, window.x0 : window.x1]
