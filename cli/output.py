@@ -1,7 +1,7 @@
 """How results reach the user: tables for people, JSON for programs, both from the same dictionary."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 import click
@@ -22,12 +22,12 @@ def emit_pairs(pairs: Iterable[tuple[str, str]]) -> None:
         click.echo(f"{name:<{width}}  {value}".rstrip())
 
 
-def emit_table(header: Row, rows: Iterable[Row]) -> None:
-    """Print a table: first column left-aligned, the others right-aligned."""
+def emit_table(header: Row, rows: Iterable[Row], left: Collection[int] = (0,)) -> None:
+    """Print a table with the columns numbered in ``left`` left-aligned, the others right-aligned."""
     table = [header, *rows]
     widths = [max(len(row[column]) for row in table) for column in range(len(header))]
     for row in table:
-        cells = [f"{row[0]:<{widths[0]}}", *(f"{cell:>{width}}" for cell, width in zip(row[1:], widths[1:], strict=True))]
+        cells = [f"{cell:<{width}}" if n in left else f"{cell:>{width}}" for n, (cell, width) in enumerate(zip(row, widths, strict=True))]
         click.echo("  ".join(cells).rstrip())
 
 

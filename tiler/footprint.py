@@ -1,16 +1,14 @@
 """Where a layer lies on the Earth and how large it is there: extent in degrees, area, and the range of its sample spacing."""
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from geographiclib.geodesic import Geodesic
 from numpy.typing import NDArray
-from rasterio.errors import RasterioError
-from rasterio.warp import transform as reproject
 
+from schemas.facts import Footprint
 from schemas.manifest import Layer, Transform
-from tiler.geodesy import ground_spacing_m
+from tiler.geodesy import geographic_places, ground_spacing_m
 
 Line = NDArray[np.float64]
 Line2D = tuple[Line, Line]
@@ -20,25 +18,6 @@ _STRIPS: Final = 16
 _POINTS: Final = 17
 """Points along each edge of a strip; straight in projection is not straight on the ellipsoid (error of a UTM zone's area: 1e-7)."""
 _PROBES: Final = 9
-
-
-@dataclass(frozen=True, slots=True)
-class Footprint:
-    """A layer on the WGS 84 ellipsoid.
-
-    ``west_deg`` and ``east_deg`` are between -180 and 180; if the layer crosses the antimeridian, west is greater than east.
-    Spacings are (smallest, largest) along rows and along columns, of level 0 [m].
-    """
-
-    west_deg: float
-    south_deg: float
-    east_deg: float
-    north_deg: float
-    crosses_antimeridian: bool
-    contains_pole: bool
-    area_m2: float
-    row_spacing_m: tuple[float, float]
-    column_spacing_m: tuple[float, float]
 
 
 def measure_footprint(layer: Layer, crs: str | None) -> Footprint | None:
@@ -94,13 +73,10 @@ def _ring(x0: float, y0: float, x1: float, y1: float) -> Line2D:
 def _places(transform: Transform, crs: str, columns: Line, rows: Line) -> Line2D | None:
     """Return longitudes and latitudes of sample coordinates, None if one has no place on the Earth."""
     a, b, c, d, e, f = transform
-    try:
-        found = reproject(crs, "EPSG:4326", (a * columns + b * rows + c).tolist(), (d * columns + e * rows + f).tolist())
-    except RasterioError:
+    found = geographic_places(crs, (a * columns + b * rows + c).tolist(), (d * columns + e * rows + f).tolist())
+    if found is None:
         return None
     longitudes, latitudes = np.array(found[0]), np.array(found[1])
-    if not (np.isfinite(longitudes).all() and np.isfinite(latitudes).all()) or np.abs(latitudes).max() > 90 + 1e-9:
-        return None
     return longitudes, np.clip(latitudes, -90, 90)
 
 
