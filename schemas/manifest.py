@@ -59,6 +59,9 @@ class Source(Model):
     decode: Literal["terrarium", "terrain-rgb"] | None = Field(description="How heights were hidden in colour; null if they were not")
     scale: float = Field(description="Factor from source values to layer values (heights: metres per unit)")
     offset: float = Field(description="Added after scaling (heights: metres)")
+    stretch: list[tuple[float, float]] | None = Field(
+        default=None, description="Range (min, max) of every colour channel that became 0 to 255, in units of the source; null if none did"
+    )
     placement: Literal["georeferenced", "spacing", "fitted", "assumed"] = Field(
         description="Why the layer lies where it lies: the file says so, --spacing was given, it was fitted to the dataset's extent, "
         "or nothing is known and samples are one unit apart"
@@ -270,7 +273,7 @@ def _version(world: World, layers: dict[str, Layer]) -> str:
     return digest(json.dumps(content, sort_keys=True, separators=(",", ":")).encode())
 
 
-def digest(data: bytes) -> str:
+def digest(data: bytes | bytearray) -> str:
     """Return the BLAKE2b-128 digest of ``data`` as 32 hexadecimal digits: the digest used for blocks, indexes and versions."""
     return hashlib.blake2b(data, digest_size=16).hexdigest()
 

@@ -1,13 +1,15 @@
 """Settings of a build and of a server: frozen, one line and unit per field, passed in, never global."""
 
 from pathlib import Path
-from typing import Literal, Self
+from typing import Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from schemas.manifest import Clamp, KernelName, LayerKind
 
 HeightEncoding = Literal["terrarium", "terrain-rgb"]
+MAX_SAMPLES: Final = 1 << 40
+"""A million by a million, 2 TiB at 16 bits: more than any file a build can finish in days, far less than what a damaged header says."""
 
 
 class Settings(BaseModel):
@@ -31,6 +33,12 @@ class BuildSettings(Settings):
     linear_light: bool = Field(default=False, description="Filter sRGB imagery in linear light")
     fill: int = Field(default=0, ge=0, le=256, description="Fill voids of heights up to this many samples across")
     enhance: str | None = Field(default=None, description="Enhancement of imagery before the pyramid is built, wavelet or wavelet:GAIN")
+    stretch: str | None = Field(
+        default=None, description="Range of 16-bit imagery that becomes 0 to 255: CUT% at both ends of every colour channel, or MIN,MAX"
+    )
+    max_samples: int = Field(
+        default=MAX_SAMPLES, ge=1, description="A source that declares more samples, over all channels, is refused before it is read"
+    )
     task: int = Field(default=2048, ge=2, description="Side of a task [level-0 samples]; has no effect on the result")
     workers: int | None = Field(
         default=None, ge=1, le=256, description="Threads; default: the processors there are; has no effect on the result"
@@ -43,7 +51,7 @@ class BuildSettings(Settings):
     height_scale: float = Field(default=1.0, allow_inf_nan=False, description="Metres per unit of the source")
     height_offset: float = Field(default=0.0, allow_inf_nan=False, description="Metres added after scaling [m]")
     spacing: float | None = Field(
-        default=None, gt=0, allow_inf_nan=False, description="Distance between samples of a source without georeference [m]"
+        default=None, ge=1e-6, le=1e7, description="Distance between samples of a source without georeference [m]"
     )
     overwrite: bool = Field(default=False, description="Replace the layer if the dataset has it already")
 

@@ -3,7 +3,7 @@
 import resource
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
@@ -28,7 +28,8 @@ from tiler.sources.convert import SampleSource, Source, choose_conversion
 from tiler.sources.disguise import refuse_disguised_heights
 from tiler.sources.files import open_file
 from tiler.stores.dataset import read_manifest
-from tiler.stores.directory import DirectoryStore
+from tiler.stores.directory import BuildClaim, DirectoryStore
+from tiler.stretch import Stretch, StretchedSource, find_ranges, parse_stretch
 from tiler.tasks import Task, plan_tasks
 from tiler.transfer import LinearLight
 
@@ -36,6 +37,7 @@ Progress = Callable[[int, int], None]
 """Called with (blocks finished, blocks in all), from any thread, one call at a time."""
 
 _PORTION_ROWS: Final = 256
+_PORTION_BYTES: Final = 8 << 20
 _MAX_PORTION_ROWS: Final = 1024
 _PUSHED_ROWS: Final = 64
 """Rows filtered at once: few enough for their levels to stay in the second-level cache, and for little memory."""
@@ -61,18 +63,22 @@ def build_layer(path: Path, output: Path, settings: BuildSettings, on_progress: 
     UsageError, InputError or StorageError; then, and when interrupted, nothing of the unfinished layer is kept.
     """
     started = perf_counter()
+    stretch = None if settings.stretch is None else parse_stretch(settings.stretch)
     store = DirectoryStore(output)
-    with store.exclusive() as abandoned:
+    _refuse_inside(path, output)
+    with store.exclusive() as claim:
         dataset = read_manifest(store)
-        if dataset is None and not abandoned:
+        _clear_abandoned(store, claim, dataset)
+        if dataset is None:
             _refuse_foreign(output)
-        reader = open_file(path, output)
+        reader = open_file(path, output, settings.max_samples)
         try:
             source = Source(reader, choose_conversion(reader.info, settings))
-            plan = plan_layer(_prepared(source, settings), dataset, settings)
+            plan = plan_layer(source, dataset, settings)
             if settings.decode is None:
                 refuse_disguised_heights(reader, source.conversion)
-            manifest, times = _build(plan, store, dataset, output, on_progress)
+            plan = replace(plan, source=_prepared(source, settings, stretch, plan.workers))
+            manifest, times = _build(plan, store, claim, dataset, on_progress)
         finally:
             reader.close()
     return BuildReport(
@@ -86,8 +92,13 @@ def build_layer(path: Path, output: Path, settings: BuildSettings, on_progress: 
     )
 
 
-def _prepared(source: SampleSource, settings: BuildSettings) -> SampleSource:
-    """Wrap the source in what changes its samples before the pyramid is built; raises UsageError for the wrong kind of layer."""
+def _prepared(source: SampleSource, settings: BuildSettings, stretch: Stretch | None, workers: int) -> SampleSource:
+    """Wrap the source in what changes its samples before the pyramid is built; raises UsageError for the wrong kind of layer.
+
+    A stretch by a cut reads the whole file, and raises InputError if there is nothing to stretch.
+    """
+    if stretch is not None:
+        source = StretchedSource(source, find_ranges(source, stretch, workers))
     if settings.fill:
         if source.conversion.kind != "height":
             raise UsageError("--fill is for heights; voids of imagery stay transparent")
@@ -110,36 +121,56 @@ def _peak_rss_bytes() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
+def _refuse_inside(path: Path, output: Path) -> None:
+    """Refuse a source that lies in the dataset: a rebuild deletes the folder of the layer it replaces."""
+    if path.resolve().is_relative_to(output.resolve()) and path.exists():
+        raise UsageError(f"{path}: lies inside {output}, where the dataset is to be; move one of them")
+
+
 def _refuse_foreign(output: Path) -> None:
-    """Refuse a folder that holds something else than a dataset: a build deletes what an unfinished one left behind."""
+    """Refuse a folder that holds something else than a dataset."""
     if foreign := sorted(entry.name for entry in output.iterdir() if not entry.name.startswith(".")):
         raise UsageError(f"{output}: not a dataset, and not empty (it holds {foreign[0]}); choose another folder for -o")
 
 
+def _clear_abandoned(store: DirectoryStore, claim: BuildClaim, dataset: Manifest | None) -> None:
+    """Delete what a killed build announced and did not publish, or replaced and did not get to delete."""
+    published = set() if dataset is None else {layer.path for layer in dataset.layers.values()}
+    for prefix in claim.abandoned:
+        if prefix not in published:
+            store.delete_prefix(prefix)
+
+
 def _build(
-    plan: Plan, store: DirectoryStore, dataset: Manifest | None, scratch: Path, on_progress: Progress
+    plan: Plan, store: DirectoryStore, claim: BuildClaim, dataset: Manifest | None, on_progress: Progress
 ) -> tuple[Manifest, StageTimes]:
-    target = Target(store, _unused_path(plan.name, dataset), plan.name, plan.lattice, plan.block, plan.codec, plan.linear_light)
+    output = Path(store.location)
+    replaced = dataset.layers[plan.name].path if dataset is not None and plan.name in dataset.layers else None
+    path = _unused_path(plan.name, replaced, output)
+    claim.announce(path, *([replaced] if replaced else []))
+    target = Target(store, path, plan.name, plan.lattice, plan.block, plan.codec, plan.linear_light)
     ledger = Ledger(plan.lattice, plan.source.conversion.channels, on_progress)
-    store.delete_prefix(target.path)
     try:
-        times = _run_tiers(plan, target, ledger, scratch)
+        times = _run_tiers(plan, target, ledger, output)
         manifest = _publish(plan, target, ledger, dataset)
     except BaseException:
         with suppress(StorageError):
-            store.delete_prefix(target.path)
+            store.delete_prefix(path)
         raise
-    if dataset is not None and plan.name in dataset.layers:
-        store.delete_prefix(dataset.layers[plan.name].path)
+    if replaced:
+        store.delete_prefix(replaced)
     return manifest, times
 
 
-def _unused_path(name: str, dataset: Manifest | None) -> str:
-    """Return a prefix that no version so far had: a reader of an old manifest finds old blocks or none, never new ones."""
-    if dataset is None or name not in dataset.layers:
-        return name
-    _, _, count = dataset.layers[name].path.partition(".")
-    return f"{name}.{int(count or 1) + 1}"
+def _unused_path(name: str, replaced: str | None, output: Path) -> str:
+    """Return a prefix that no version so far had and that nothing lies under.
+
+    A reader of an old manifest then finds old blocks or none, never new ones, and nobody's files are in the way.
+    """
+    count = 1 if replaced is None else int(replaced.partition(".")[2] or 1) + 1
+    while (output / (path := name if count == 1 else f"{name}.{count}")).exists():
+        count += 1
+    return path
 
 
 class _Carried:
@@ -192,9 +223,6 @@ class _TaskRunner:
     def __init__(self, plan: Plan, target: Target, ledger: Ledger, samples: Samples, carried: _Carried | None) -> None:
         self._plan, self._target, self._ledger = plan, target, ledger
         self._samples, self._carried = samples, carried
-        chunk = plan.source.info.chunk_rows
-        # Portions end where the file's tiles do, or each tile would be decoded twice.
-        self._portion_rows = min(max(1, _PORTION_ROWS // chunk) * chunk, _MAX_PORTION_ROWS)
 
     def __call__(self, task: Task) -> StageTimes:
         """Run ``task``; returns the seconds it took by stage."""
@@ -212,10 +240,11 @@ class _TaskRunner:
 
         cascade = Cascade(size, windows, plan.source.conversion.channels, plan.recipe, sink)
         whole, times = windows[0], cutter.times
+        portion_rows = self._portion_rows(whole.width)
         started = perf_counter()
         y = whole.y0
         while y < whole.y1:
-            end = min(whole.y1, (y // self._portion_rows + 1) * self._portion_rows)
+            end = min(whole.y1, (y // portion_rows + 1) * portion_rows)
             before_read = perf_counter()
             values, coverage = self._samples.read(Rect(whole.x0, y, whole.x1, end))
             times.read_s += perf_counter() - before_read
@@ -225,6 +254,12 @@ class _TaskRunner:
             y = end
         times.filter_s = perf_counter() - started - times.read_s - times.encode_s - times.write_s
         return times
+
+    def _portion_rows(self, width: int) -> int:
+        """Return how many rows are read at once: whole tiles, or each would be decoded twice, but no more memory than needed."""
+        chunk = self._plan.source.info.chunk_rows
+        affordable = _PORTION_BYTES // (width * self._plan.source.conversion.channels * 4)
+        return min(max(1, min(affordable, _PORTION_ROWS) // chunk) * chunk, _MAX_PORTION_ROWS)
 
 
 def _publish(plan: Plan, target: Target, ledger: Ledger, dataset: Manifest | None) -> Manifest:
@@ -288,6 +323,7 @@ def _source_entry(plan: Plan) -> SourceEntry:
         decode=conversion.decode,
         scale=conversion.scale,
         offset=conversion.offset,
+        stretch=None if conversion.stretch is None else list(conversion.stretch),
         placement=plan.placement.how,
     )
 

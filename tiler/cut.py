@@ -165,33 +165,37 @@ class Cutter:
         target = self._target
         own = target.lattice.valid_core(address).shifted(-seen.x0, -seen.y0)
         core = np.s_[own.y0 : own.y1, own.x0 : own.x1]
+        if address.level and target.codec.value_range is not None:
+            # What the filter overshot is clipped; it is measured as readers will see it.
+            lowest, highest = target.codec.value_range
+            samples = np.clip(samples, np.float32(lowest), np.float32(highest))
         valid = samples[core][..., -1] > 0 if target.block.alpha else None if mask is None else mask[core]
         count, (minima, maxima, sums) = measure(samples[core], valid, samples.shape[-1] - target.block.alpha)
         if not count:
             return CutBlock(address, BLANK, (), (), ())
         low, high = float(minima.min()), float(maxima.max())
+        if address.level == 0:
+            self._check_range(address, low, high)
         started = perf_counter()
         whole = target.lattice.core(address).grown(target.lattice.pad)
-        data = target.codec.encode(*_completed(self._within_range(address, samples, low, high), mask, seen, whole, target.block))
+        data = target.codec.encode(*_completed(samples, mask, seen, whole, target.block))
         encoded = perf_counter()
         target.store.write(target.key(address), data)
         self.times.encode_s += encoded - started
         self.times.write_s += perf_counter() - encoded
         return CutBlock(address, BlockRecord(digest(data), len(data), count, low, high), _floats(minima), _floats(maxima), _floats(sums))
 
-    def _within_range(self, address: BlockAddress, samples: Samples, low: float, high: float) -> Samples:
-        """Refuse source values the codec cannot hold; clip what the filter overshot on coarser levels."""
+    def _check_range(self, address: BlockAddress, low: float, high: float) -> None:
+        """Refuse source values the codec cannot hold; a value beside the end of the range by rounding is none of them."""
         limits = self._target.codec.value_range
         if limits is None:
-            return samples
-        if address.level:
-            return np.clip(samples, np.float32(limits[0]), np.float32(limits[1]))
-        if low < limits[0] or high > limits[1]:
+            return
+        margin = 1e-6 * (limits[1] - limits[0])
+        if low < limits[0] - margin or high > limits[1] + margin:
             raise InputError(
-                f"codec {self._target.codec.spec} holds values from {limits[0]:g} to {limits[1]:g} only, but the source has "
-                f"{low:g} to {high:g} in block {address}; use another scale and offset, or lerc"
+                f"codec {self._target.codec.spec} holds values from {limits[0]:.9g} to {limits[1]:.9g} only, but the source has "
+                f"{low:.9g} to {high:.9g} in block {address}; use another scale and offset, or lerc"
             )
-        return samples
 
 
 def _floats(values: NDArray[np.generic]) -> tuple[float, ...]:

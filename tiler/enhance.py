@@ -122,7 +122,7 @@ class EnhancedSource:
     """A source of imagery whose samples are enhanced; the coverage is that of the file.
 
     Beyond the edge of the file it is mirrored. Smoothing is weighed by coverage, so nothing that is void takes part; near voids,
-    where smoothing is one-sided, the amplification fades. Results stay within the range of the file's type. Raises MissingExtraError
+    where smoothing is one-sided, the amplification fades. Results stay within the range of the stored type. Raises MissingExtraError
     without PyWavelets, UsageError for heights.
     """
 
@@ -135,7 +135,7 @@ class EnhancedSource:
         self._source = source
         self._gain = enhancement.gain
         self._starlet = _Starlet()
-        self._top = float(np.iinfo(source.info.dtype).max)
+        self._top = float(np.iinfo(source.conversion.dtype).max)
         self._local = threading.local()
 
     def read(self, window: Rect) -> tuple[Float32, Float32 | None]:

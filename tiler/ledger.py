@@ -2,9 +2,8 @@
 
 import threading
 from collections.abc import Callable
-from math import fsum
-
-import numpy as np
+from fractions import Fraction
+from math import inf
 
 from schemas.blockindex import RECORD_BYTES, pack_record
 from schemas.lattice import Lattice
@@ -23,8 +22,9 @@ class Ledger:
         self._records = [bytearray(count * RECORD_BYTES) for count in counts]
         self._stored = [bytearray(-(-count // 8)) for count in counts]
         self._stored_bytes = [0] * lattice.levels
-        # Minimum, maximum, sum per colour channel of every finest block; NaN for blanks.
-        self._finest = np.full((counts[0], 3, colours), np.nan)
+        self._minima, self._maxima = [inf] * colours, [-inf] * colours
+        # Exact, so that the order in which blocks finish cannot matter; a float64 is a fraction.
+        self._sums = [Fraction(0)] * colours
         self._valid = 0
         self._lock = threading.Lock()
 
@@ -37,7 +37,9 @@ class Ledger:
                 self._stored[level][number // 8] |= 1 << number % 8
                 self._stored_bytes[level] += block.record.length_bytes
                 if level == 0:
-                    self._finest[number] = block.minima, block.maxima, block.sums
+                    self._minima = list(map(min, self._minima, block.minima))
+                    self._maxima = list(map(max, self._maxima, block.maxima))
+                    self._sums = [total + Fraction(part) for total, part in zip(self._sums, block.sums, strict=True)]
                     self._valid += block.record.valid
             self._done += 1
             self._on_progress(self._done, self._total)
@@ -61,17 +63,12 @@ class Ledger:
             blank=columns * rows - stored,
             stored_bytes=self._stored_bytes[level],
             availability=pack_availability(bytes(self._stored[level]), columns * rows),
-            index=digest(self.index(level)),
+            index=digest(self._records[level]),
         )
 
     def statistics(self) -> Statistics:
-        """Return the statistics of level 0; sums are exact (``fsum``), so they do not depend on the order of blocks."""
-        seen = self._finest[~np.isnan(self._finest[:, 0, 0])]
-        if not len(seen):
+        """Return the statistics of level 0."""
+        if not self._valid:
             return Statistics(min=[], max=[], mean=[], valid=0)
-        return Statistics(
-            min=seen[:, 0].min(axis=0).tolist(),
-            max=seen[:, 1].max(axis=0).tolist(),
-            mean=[fsum(channel) / self._valid for channel in seen[:, 2].T],
-            valid=self._valid,
-        )
+        means = [float(total / self._valid) for total in self._sums]
+        return Statistics(min=self._minima, max=self._maxima, mean=means, valid=self._valid)

@@ -20,7 +20,7 @@ from tiler.sources.convert import SampleSource
 from tiler.tasks import Tier, plan_tiers
 
 _MAX_BLOCKS: Final = 1 << 27
-"""The block index of the finest level is held in memory: 4 GiB at this number."""
+"""The block index is held in memory: 6 GiB for all levels at this number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,7 @@ def plan_layer(source: SampleSource, dataset: Manifest | None, settings: BuildSe
         kind=conversion.kind,
         side=lattice.stored_side,
         channels=conversion.channels + alpha,
-        dtype="float32" if conversion.kind == "height" else "uint8" if info.dtype == np.uint8 else "uint16",
+        dtype=conversion.dtype,
         alpha=alpha,
     )
     radius = settings.radius or (1 if settings.filter in FIXED_RADIUS else defaults.radius)
@@ -114,4 +114,4 @@ def _png16_spec(source: SampleSource) -> str:
         return "png16"
     scale, offset = source.conversion.scale, source.conversion.offset
     lowest = min(limits.min * scale, limits.max * scale) + offset
-    return f"png16:{abs(scale):.9g},{lowest:.9g}"
+    return f"png16:{abs(scale)!r},{lowest!r}"

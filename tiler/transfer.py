@@ -40,7 +40,7 @@ class LinearLight:
         self.info: FileInfo = source.info
         self.conversion: Conversion = source.conversion
         self.masked: bool = source.masked
-        self._light = _light_of_codes(int(np.iinfo(source.info.dtype).max))
+        self._light = _light_of_codes(int(np.iinfo(source.conversion.dtype).max))
 
     def read(self, window: Rect) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """Return light (rows, columns, channels) and coverage of ``window``."""

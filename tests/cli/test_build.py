@@ -10,7 +10,7 @@ import pytest
 
 from cli.main import COMMANDS
 from tests.cli.conftest import Clipmap, Golden, Sources
-from tests.contract.picture_files import KINDS, content, file_name, png_bytes, write_with_rasterio
+from tests.contract.picture_files import KINDS, content, file_name, png_bytes, write_with_openimageio, write_with_rasterio
 from tiler.stores.dataset import open_dataset
 
 
@@ -75,11 +75,21 @@ def test_remarks_go_to_stderr(sources: Sources, tmp_path: Path, clipmap: Clipmap
     assert ran.err == "note: photo.tif has no georeference and no --spacing: samples lie one unit apart\n"
 
 
+def test_a_stretch_is_told_by_inspect(tmp_path: Path, clipmap: Clipmap) -> None:
+    write_with_rasterio(tmp_path / "scene.tif", content(3, "uint16"))
+    clipmap("build", tmp_path / "scene.tif", "-o", tmp_path / "out", "--stretch", "-20.5,40000")
+    source = next(line for line in clipmap("inspect", tmp_path / "out").out.splitlines() if line.startswith("source"))
+    assert "3 x uint16, stretched from -20.5 to 40000, assumed" in source
+    found = json.loads(clipmap("inspect", tmp_path / "out", "--json").out)
+    assert found["layers"][0]["source"]["stretch"] == [[-20.5, 40000]] * 3
+
+
 def damaged(folder: Path) -> dict[str, Path]:
     """Files that no build gets through, by name."""
     folder.mkdir()
     paths = {
-        name: folder / f"{name}.tif" for name in ("empty", "text", "rgba16", "grey8", "mixed", "five", "cut", "deep", "huge", "colour")
+        name: folder / f"{name}.tif"
+        for name in ("empty", "text", "rgba16", "grey8", "mixed", "five", "cut", "short", "deep", "huge", "colour", "deep_colour", "turned")
     }
     paths["empty"].write_bytes(b"")
     paths["text"].write_text("not a picture\n")
@@ -88,8 +98,13 @@ def damaged(folder: Path) -> dict[str, Path]:
     write_with_rasterio(paths["colour"], content(3, "uint8"))
     write_with_rasterio(paths["deep"], content(3, "float32"))
     write_with_rasterio(paths["huge"], np.full((64, 64, 1), 1e300))
-    write_with_rasterio(paths["cut"], content(1, "int16", 500, 500))
-    paths["cut"].write_bytes(paths["cut"].read_bytes()[:300_000])
+    write_with_rasterio(paths["cut"], content(1, "int16", 500, 500), compress="DEFLATE")
+    paths["cut"].write_bytes(paths["cut"].read_bytes()[: paths["cut"].stat().st_size // 2])
+    write_with_rasterio(paths["short"], content(1, "int16", 500, 500))
+    paths["short"].write_bytes(paths["short"].read_bytes()[:300_000])
+    write_with_rasterio(paths["deep_colour"], np.full((64, 64, 3), 500, np.uint16))
+    write_with_openimageio(paths["turned"], content(3, "uint8"), Orientation=6)
+    paths["turned"].with_suffix(".tfw").write_text("10\n0\n0\n-10\n500005\n4999995\n")
     for kind in KINDS:
         if kind.name in (
             "png-3xuint8",
@@ -133,7 +148,18 @@ FAILURES: list[tuple[str, list[str], int, str]] = [
     ("grey8", ["--layer", "relief"], 2, "'relief'"),
     ("deep", ["--layer", "imagery"], 3, "8 or 16 bits without sign"),
     ("deep", ["--layer", "height"], 3, "heights have one channel, this has 3"),
-    ("huge", [], 3, "beyond the range of float32"),
+    ("huge", [], 3, "1e+300 is no height; if it marks voids, give --nodata 1e+300"),
+    ("huge", ["--height-scale", "1e-20"], 3, "1e+300 is no height"),
+    ("short", [], 3, "has 300000 bytes, but its samples alone take 500000; the file is cut off"),
+    ("turned", [], 3, "has a georeference and is stored rotated or mirrored (orientation 6)"),
+    ("colour", ["--max-samples", "99"], 3, "samples, more than 99; if that is what it holds, give --max-samples"),
+    ("colour", ["--max-samples", "0"], 2, "--max-samples: Input should be greater than or equal to 1"),
+    ("colour", ["--stretch", "2%"], 2, "has 8 bits already"),
+    ("deep_colour", ["--stretch", "2"], 2, "--stretch '2': expected CUT%"),
+    ("deep_colour", ["--stretch", "9,9"], 2, "MIN must be less than MAX"),
+    ("deep_colour", ["--stretch", "2%"], 3, "channel 1 has no range to stretch, its samples are 500"),
+    ("deep_colour", ["--stretch", "2%", "--nodata", "500"], 3, "has no valid sample, so there is no range to stretch"),
+    ("deep_colour", ["--stretch", "2%", "--layer", "height", "--bands", "1"], 2, "--stretch is for imagery"),
     ("hidden", [], 2, "looks like heights hidden in colour; build it with --layer height --decode terrain-rgb"),
     ("hidden", ["--layer", "imagery"], 2, "--decode none"),
     ("colour", ["--decode", "terrarium", "--layer", "imagery"], 2, "are for heights"),

@@ -4,10 +4,11 @@ import math
 
 import pytest
 
+from schemas.facts import Footprint
 from schemas.lattice import Registration
 from schemas.manifest import Layer, Transform
 from tests.schemas.sample_manifest import make_manifest
-from tiler.footprint import Footprint, measure_footprint
+from tiler.footprint import measure_footprint
 
 EARTH_M2 = 510_065_621_724_089
 """Area of the WGS 84 ellipsoid (GeographicLib)."""

@@ -137,6 +137,8 @@ def _png16(block: BlockFormat, parameters: str) -> Png16Codec:
     if not scale or not offset:
         raise UsageError("codec png16 needs a scale and an offset in metres for this source, e.g. png16:0.1,-500; or use lerc")
     scale_m, offset_m = _number(scale, "png16", "the scale"), _number(offset, "png16", "the offset")
+    if not abs(offset_m) + 65535 * scale_m < 1e30:
+        raise UsageError(f"codec png16:{parameters}: such heights are beyond any planet")
     if scale_m <= 0:
         raise UsageError(f"codec png16:{parameters}: the scale must be more than 0 metres")
     return Png16Codec(block, scale_m, offset_m)

@@ -50,6 +50,17 @@ class FileInfo:
     compression: str | None = None
     """How the pixels are compressed, as GDAL names it."""
     georeference: Georeference | None = None
+    bits: int | None = None
+    """Bits that whole numbers use of their type, from the lowest; None: all."""
+    orientation: int = 1
+    """How stored rows and columns lie in the picture, 1 to 8 as EXIF and TIFF count; 1 is upright."""
+    least_bytes: int = 0
+    """What the samples take if they are not compressed, 0 if unknown; a smaller file is cut off [bytes]."""
+
+    @property
+    def largest(self) -> int:
+        """The largest whole number a sample can be; raises ValueError for other types."""
+        return int(np.iinfo(self.dtype).max) if self.bits is None else (1 << self.bits) - 1
 
     @property
     def rect(self) -> Rect:

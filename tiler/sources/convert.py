@@ -1,4 +1,4 @@
-"""From a file's pixels to samples: channel choice, voids, alpha, heights hidden in colour, units.
+"""From a file's pixels to samples: channel choice, voids, alpha, heights hidden in colour, units, bits.
 
 Samples are float32 with a coverage between 0 (void) and 1. Void samples are set to 0, so that what lay under them cannot
 reach any result.
@@ -11,18 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import InputError, UsageError
-from schemas.manifest import LayerKind
+from schemas.manifest import LayerKind, SampleType
 from schemas.region import Rect
 from schemas.settings import BuildSettings, HeightEncoding
 from tiler.sources import FileInfo, Pixels, Reader
 
 _EXACT_INTEGERS: Final = 2**24
 """Whole numbers up to here survive the conversion to float32."""
+_HIGHEST: Final = 1e30
+"""No height in any unit, but what programs write that have no value: 3.4e38, 1.7e38, -1e32."""
 
 
 @dataclass(frozen=True, slots=True)
 class Conversion:
-    """How pixels of one file become samples of one layer; ``colours`` are the channels taken, from 0, ``alpha`` one more or None."""
+    """How pixels of one file become samples of one layer; ``colours`` are the channels taken, from 0, ``alpha`` one more or None.
+
+    ``dtype`` is the type that samples are stored in. ``stretch`` is the range (min, max) of every colour channel that became 0 to 255.
+    """
 
     kind: LayerKind
     colours: tuple[int, ...]
@@ -32,6 +37,8 @@ class Conversion:
     decode: HeightEncoding | None
     scale: float
     offset: float
+    dtype: SampleType
+    stretch: tuple[tuple[float, float], ...] | None = None
 
     @property
     def channels(self) -> int:
@@ -97,7 +104,7 @@ class Source:
             alpha = pixels[..., self.conversion.alpha]
             coverage = alpha.astype(np.float32)
             if alpha.dtype.kind == "u":
-                coverage /= np.float32(np.iinfo(alpha.dtype).max)
+                coverage /= np.float32(self.info.largest)
             coverage = np.clip(np.nan_to_num(coverage, nan=0.0), 0, 1)
         if mask is not None:
             coverage *= mask.astype(np.float32) / np.float32(255)
@@ -118,16 +125,27 @@ class Source:
             and np.abs(colours.astype(np.float64)).max(initial=0) > _EXACT_INTEGERS
         ):
             raise InputError(f"{self.info.path}: whole numbers beyond {_EXACT_INTEGERS} would be rounded; scale the file down first")
+        if colours.dtype.kind == "f":
+            self._refuse_absurd(colours)
         exact = conversion.decode is None and (conversion.scale, conversion.offset) == (1.0, 0.0)
         with np.errstate(over="ignore", under="ignore"):
-            values = np.ascontiguousarray(colours, np.float32) if exact else _in_metres(colours, conversion)
+            values = np.ascontiguousarray(colours, np.float32) if exact else _scaled(colours, conversion)
             if conversion.premultiplied and coverage is not None:
                 np.divide(values, coverage[..., np.newaxis], out=values, where=coverage[..., np.newaxis] > 0)
         if not exact and coverage is not None:
             values[coverage == 0] = 0
         if (not exact or colours.dtype == np.float64 or conversion.premultiplied) and not np.isfinite(values).all():
             raise InputError(f"{self.info.path}: values beyond the range of float32; if they mark voids, say so with --nodata")
+        if colours.dtype.kind == "f":
+            values += np.float32(0)  # -0 becomes 0: equal heights have equal bytes
         return values
+
+    def _refuse_absurd(self, heights: Pixels) -> None:
+        """Raise InputError if valid floats are beyond all heights: a mark for voids that the file does not declare."""
+        low, high = heights.min(initial=0), heights.max(initial=0)
+        extreme = high if high >= -low else low
+        if abs(float(extreme)) > _HIGHEST:
+            raise InputError(f"{self.info.path}: {extreme!s} is no height; if it marks voids, give --nodata {extreme!s}")
 
 
 def _chosen(pixels: Pixels, channels: tuple[int, ...]) -> Pixels:
@@ -141,7 +159,7 @@ def _in_dtype(value: float, dtype: np.dtype[Any]) -> float:
         return float(dtype.type(value)) if dtype.kind == "f" else value
 
 
-def _in_metres(colours: Pixels, conversion: Conversion) -> NDArray[np.float32]:
+def _scaled(colours: Pixels, conversion: Conversion) -> NDArray[np.float32]:
     units = _decoded(colours, conversion.decode) if conversion.decode else colours.astype(np.float64)
     return (units * conversion.scale + conversion.offset).astype(np.float32)
 
@@ -170,6 +188,9 @@ def choose_conversion(info: FileInfo, settings: BuildSettings) -> Conversion:
         _check_height(info, colours, decode)
     else:
         _check_imagery(info, colours, settings)
+    _check_stretch(info, kind, settings)
+    # With --stretch the numbers of the file are stretched, not those scaled to its type.
+    full = np.iinfo(info.dtype).max / info.largest if kind == "imagery" and settings.stretch is None else 1.0
     return Conversion(
         kind=kind,
         colours=colours,
@@ -177,8 +198,9 @@ def choose_conversion(info: FileInfo, settings: BuildSettings) -> Conversion:
         premultiplied=info.premultiplied and alpha is not None,
         nodata=_nodata(info, settings),
         decode=decode,
-        scale=settings.height_scale if kind == "height" else 1.0,
+        scale=settings.height_scale if kind == "height" else full,
         offset=settings.height_offset if kind == "height" else 0.0,
+        dtype="float32" if kind == "height" else "uint8" if info.dtype == np.uint8 or settings.stretch is not None else "uint16",
     )
 
 
@@ -220,6 +242,15 @@ def _check_imagery(info: FileInfo, colours: tuple[int, ...], settings: BuildSett
             f"{info.path}: imagery has 1 or 3 colour channels and perhaps alpha, this has {len(colours)}; "
             "choose with --bands, e.g. --bands 1,2,3"
         )
+
+
+def _check_stretch(info: FileInfo, kind: LayerKind, settings: BuildSettings) -> None:
+    if settings.stretch is None:
+        return
+    if kind != "imagery":
+        raise UsageError(f"{info.path}: --stretch is for imagery, stretched heights would be false; leave it out")
+    if info.dtype == np.uint8:
+        raise UsageError(f"{info.path}: has 8 bits already, and --stretch makes 8 bits of 16; leave it out")
 
 
 def _nodata(info: FileInfo, settings: BuildSettings) -> float | None:

@@ -55,22 +55,36 @@ def _info(path: Path, dataset: Any) -> FileInfo | None:  # noqa: ANN401
     block_rows, block_columns = dataset.block_shapes[0]
     alphas = [channel for channel, meaning in enumerate(dataset.colorinterp) if meaning == ColorInterp.alpha]
     layout: Layout = "tiled" if block_columns < dataset.width or block_rows >= dataset.height else "striped"
+    dtype = np.dtype(dataset.dtypes[0])
+    bits = int(dataset.tags(1, ns="IMAGE_STRUCTURE").get("NBITS", 8 * dtype.itemsize))
+    structure = dataset.tags(ns="IMAGE_STRUCTURE")
     return FileInfo(
         path=path,
         format=str(dataset.driver),
         width=int(dataset.width),
         height=int(dataset.height),
         channels=int(dataset.count),
-        dtype=np.dtype(dataset.dtypes[0]),
+        dtype=dtype,
         file_bytes=path.stat().st_size,
         layout="sequential" if dataset.driver in _WHOLE_IMAGE_DRIVERS else layout,
         chunk_rows=int(block_rows),
         alpha=alphas[0] if alphas else None,
         nodata=None if dataset.nodata is None else float(dataset.nodata),
         has_mask=MaskFlags.per_dataset in flags and MaskFlags.alpha not in flags,
-        compression=dataset.tags(ns="IMAGE_STRUCTURE").get("COMPRESSION"),
+        compression=structure.get("COMPRESSION"),
         georeference=_georeference(dataset),
+        bits=bits if dtype.kind == "u" and bits < 8 * dtype.itemsize else None,
+        least_bytes=dataset.width * dataset.height * dataset.count * bits // 8 if _is_plain(path, dataset, structure) else 0,
     )
+
+
+def _is_plain(path: Path, dataset: Any, structure: dict[str, str]) -> bool:  # noqa: ANN401
+    """Whether every sample that GDAL counts takes its place in the file, which is not so for every colour space."""
+    if dataset.driver == "netCDF":
+        with path.open("rb") as file:
+            return file.read(3) == b"CDF"
+    tiff = dataset.driver == "GTiff" and structure.get("SOURCE_COLOR_SPACE") in (None, "CMYK")
+    return dataset.driver == "ENVI" or (tiff and "COMPRESSION" not in structure)
 
 
 def _georeference(dataset: Any) -> Georeference | None:  # noqa: ANN401

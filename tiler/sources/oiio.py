@@ -48,9 +48,8 @@ def describe(path: Path) -> FileInfo:
     dtype = np.dtype(_DTYPES.get(str(spec.format), str(spec.format)))
     if spec.depth > 1 or spec.deep:
         raise InputError(f"{path}: volumes and deep images are not pictures of terrain")
-    if spec.get_int_attribute("Orientation", 1) != 1:
-        raise InputError(f"{path}: stored rotated or mirrored (orientation tag); write it upright first, e.g. with oiiotool --reorient")
-    alpha = int(spec.alpha_channel)
+    orientation = spec.get_int_attribute("Orientation", 1)
+    alpha = _alpha(spec)
     tiled = spec.tile_width > 0
     chunk = spec.get_int_attribute("tiff:RowsPerStrip", 0) or spec.get_int_attribute("oiio:RowsPerChunk", 1)
     strip_rows = spec.tile_height if tiled else chunk
@@ -69,9 +68,19 @@ def describe(path: Path) -> FileInfo:
         file_bytes=path.stat().st_size,
         layout=layout,
         chunk_rows=max(1, int(strip_rows)),
-        alpha=alpha if alpha >= 0 else None,
-        premultiplied=alpha >= 0 and name in _PREMULTIPLIED_BY_DEFAULT and not unassociated,
+        alpha=alpha,
+        premultiplied=alpha is not None and name in _PREMULTIPLIED_BY_DEFAULT and not unassociated,
+        # Programs show a picture with an orientation that does not exist as it is stored.
+        orientation=orientation if 1 <= orientation <= 8 else 1,
     )
+
+
+def _alpha(spec: OpenImageIO.ImageSpec) -> int | None:
+    """Return which channel is alpha; by its name where the number is none of a channel, as with GIF."""
+    if spec.alpha_channel < spec.nchannels:
+        return int(spec.alpha_channel) if spec.alpha_channel >= 0 else None
+    named = [channel for channel, name in enumerate(spec.channelnames) if name.lower() in ("a", "alpha")]
+    return named[0] if named else None
 
 
 class OiioReader:

@@ -1,7 +1,9 @@
 """A store in a directory: one file per key, written to a temporary name and renamed."""
 
+import ctypes
 import fcntl
 import os
+import re
 import shutil
 import threading
 from collections.abc import Iterator
@@ -11,7 +13,10 @@ from pathlib import Path
 from schemas.errors import NotFoundError, StorageError
 
 _TEMPORARY = ".tmp-"
-_LOCK = ".lock"
+_LOCK = ".clipmap-lock"
+_CLAIM = "clipmap build"
+_PREFIX = re.compile(r"[a-z][a-z0-9_.]*")
+_LIBC = ctypes.CDLL(None, use_errno=True)
 
 
 class DirectoryStore:
@@ -93,11 +98,19 @@ class DirectoryStore:
 
     def sync(self) -> None:
         """Flush what was written to the disk, so that a manifest never survives a power cut that its blocks did not."""
-        os.sync()
+        if not self._root.exists():
+            return
+        descriptor = os.open(self._root, os.O_RDONLY)
+        try:
+            # Only the file system of the store: os.sync() would wait for every disk of the machine.
+            if _LIBC.syncfs(descriptor) != 0:
+                os.sync()
+        finally:
+            os.close(descriptor)
 
     @contextmanager
-    def exclusive(self) -> Iterator[bool]:
-        """Keep other builds out of the store; gives True if the last one was killed and left its lock file behind.
+    def exclusive(self) -> Iterator["BuildClaim"]:
+        """Keep other builds out of the store as long as the block lasts.
 
         The lock is the kernel's (``flock``), so it ends with the process however that ends. Makes the directory if there is
         none, and removes it again if nothing was put in. Raises StorageError if another build is at work or the directory cannot
@@ -107,12 +120,13 @@ class DirectoryStore:
         try:
             made = [folder for folder in (self._root, *self._root.parents) if not folder.exists()]
             self._root.mkdir(parents=True, exist_ok=True)
-            abandoned = path.exists()
             descriptor = self._locked(path)
+        except (FileExistsError, NotADirectoryError):
+            raise StorageError(f"{self._root}: a file is in the way, or a link that leads nowhere; choose another folder") from None
         except OSError as error:
             raise StorageError(f"{self._root}: cannot be written: {error.strerror}") from error
         try:
-            yield abandoned
+            yield BuildClaim(descriptor)
         finally:
             path.unlink(missing_ok=True)
             os.close(descriptor)
@@ -126,11 +140,35 @@ class DirectoryStore:
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                owner = os.pread(descriptor, 20, 0).decode("ascii", "replace") or "unknown"
+                _, owner = _read_claim(descriptor)
                 os.close(descriptor)
                 raise StorageError(f"{self._root}: another build is writing here (process {owner}); wait until it has ended") from None
             if path.exists() and os.path.samestat(os.fstat(descriptor), path.stat()):
-                os.ftruncate(descriptor, 0)
-                os.pwrite(descriptor, str(os.getpid()).encode(), 0)
                 return descriptor
             os.close(descriptor)  # its owner removed the file between our opening and locking it
+
+
+class BuildClaim:
+    """A build's hold on a store. Its file says who holds it and which prefixes are being written or deleted.
+
+    So the build after a killed one knows exactly what was left behind, and deletes that and nothing else.
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self.abandoned, _ = _read_claim(descriptor)
+        self.announce(*self.abandoned)
+
+    def announce(self, *prefixes: str) -> None:
+        """Write down the prefixes that are no dataset's until the build has ended."""
+        text = "\n".join([_CLAIM, str(os.getpid()), *prefixes]) + "\n"
+        os.ftruncate(self._descriptor, 0)
+        os.pwrite(self._descriptor, text.encode(), 0)
+
+
+def _read_claim(descriptor: int) -> tuple[tuple[str, ...], str]:
+    """Return the prefixes and the process of a claim; none and 'unknown' if the file is not one."""
+    lines = os.pread(descriptor, 65536, 0).decode("utf-8", "replace").splitlines()
+    if len(lines) < 2 or lines[0] != _CLAIM:
+        return (), "unknown"
+    return tuple(line for line in lines[2:] if _PREFIX.fullmatch(line)), lines[1]
