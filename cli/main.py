@@ -1,9 +1,11 @@
 """The ``clipmap`` command: finds the subcommand, turns errors into one sentence and an exit code."""
 
 import os
+import signal
 import sys
 from importlib import import_module
-from typing import Final
+from types import FrameType
+from typing import Final, NoReturn
 
 import click
 
@@ -58,21 +60,38 @@ def run(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code; a user's mistake ends in one sentence on stderr."""
     try:
         result = cli.main(args=arguments, prog_name="clipmap", standalone_mode=False)
+        sys.stdout.flush()
     except click.exceptions.Exit as stop:
         return stop.exit_code
-    except click.ClickException as error:
-        _show(error)
-        return error.exit_code
-    except (click.Abort, KeyboardInterrupt):
-        click.echo("clipmap: interrupted", err=True)
-        return INTERRUPTED
-    except ClipmapError as error:
-        click.echo(f"clipmap: {error}", err=True)
-        return exit_code(error)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except SystemExit:  # how click ends when the reader of a pipe has gone
         return STORAGE
+    except (click.ClickException, click.Abort, ClipmapError, OSError, KeyboardInterrupt, _TerminatedError) as error:
+        return _ended(error)
     return result if isinstance(result, int) else 0
+
+
+def _ended(error: BaseException) -> int:
+    """Say on stderr why the command ended, in one sentence, and return its exit code."""
+    match error:
+        case click.ClickException():
+            _show(error)
+            code = error.exit_code
+        case ClipmapError():
+            click.echo(f"clipmap: {error}", err=True)
+            code = exit_code(error)
+        case _TerminatedError():
+            click.echo("clipmap: terminated", err=True)
+            code = 128 + error.number
+        case OSError():
+            # Nothing more can be written to standard output: not by us, and not by Python when it ends.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            if not isinstance(error, BrokenPipeError):
+                click.echo(f"clipmap: {error.filename or 'standard output'}: {error.strerror}", err=True)
+            code = STORAGE
+        case _:
+            click.echo("clipmap: interrupted", err=True)
+            code = INTERRUPTED
+    return code
 
 
 def _show(error: click.ClickException) -> None:
@@ -85,6 +104,20 @@ def _show(error: click.ClickException) -> None:
     click.echo(f"clipmap: {error.format_message().rstrip('.')}{hint}", err=True)
 
 
+class _TerminatedError(BaseException):
+    """SIGTERM or SIGHUP came: like an interrupt, what is unfinished is cleaned up on the way out."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
+def _terminate(number: int, frame: FrameType | None) -> NoReturn:
+    raise _TerminatedError(number)
+
+
 def main() -> None:
     """Entry point of the console script."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, _terminate)
     sys.exit(run())

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from schemas.manifest import Clamp, KernelName, LayerKind
 
@@ -55,12 +55,17 @@ class BuildSettings(Settings):
     )
     overwrite: bool = Field(default=False, description="Replace the layer if the dataset has it already")
 
+    @field_validator("bands")
+    @classmethod
+    def _counted_from_one(cls, bands: tuple[int, ...] | None) -> tuple[int, ...] | None:
+        if bands is not None and min(bands) < 1:
+            raise ValueError("channels are counted from 1")
+        return bands
+
     @model_validator(mode="after")
     def _sensible(self) -> Self:
         if self.height_scale == 0:
             raise ValueError("height_scale must not be 0")
-        if self.bands is not None and min(self.bands) < 1:
-            raise ValueError("bands are counted from 1")
         return self
 
 

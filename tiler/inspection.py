@@ -136,7 +136,8 @@ def parse_target(dataset: Dataset, target: str) -> tuple[str, int | None, BlockA
         return parsed.layer, parsed.address.level, parsed.address
     name, *numbers = target.split("/")
     if len(numbers) not in (0, 1, 3) or not all(number.isascii() and number.isdecimal() and len(number) < 20 for number in numbers):
-        raise UsageError(f"{target!r}: expected LAYER, LAYER/LEVEL, LAYER/LEVEL/X/Y or the name of a block")
+        shown = target if len(target) <= 60 else f"{target[:57]}..."
+        raise UsageError(f"{shown!r}: expected LAYER, LAYER/LEVEL, LAYER/LEVEL/X/Y or the name of a block")
     dataset.manifest.layer(name)
     if not numbers:
         return name, None, None

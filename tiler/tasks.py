@@ -2,10 +2,13 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Final
 
 from schemas.lattice import Lattice
 from schemas.region import Rect
 from tiler.sources import Layout
+
+_BAND: Final = 32768
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,10 +35,13 @@ def plan_tiers(lattice: Lattice, task_side: int) -> list[Tier]:
 
 
 def plan_tasks(lattice: Lattice, tier: Tier, layout: Layout) -> Iterator[Task]:
-    """Yield the tasks of a tier in row order; full-width bands where the source can only be read so, else squares."""
+    """Yield the tasks of a tier in row order: squares, or bands where the source's strips are decoded over their full width.
+
+    A band is at most 32768 samples wide, so that memory stays bounded; wider strips are decoded once per band.
+    """
     side = lattice.block << tier.count
     width, height = lattice.level_size(tier.first)
-    step = width if layout == "striped" and tier.first == 0 else side
+    step = max(side, _BAND // side * side) if layout == "striped" and tier.first == 0 else side
     for y in range(0, height, side):
         for x in range(0, width, step):
             yield Task(tier, Rect(x, y, min(x + step, width), min(y + side, height)))

@@ -247,8 +247,8 @@ def test_output_that_is_no_dataset(sources: Sources, tmp_path: Path, clipmap: Cl
     (tmp_path / "damaged" / "manifest.json").write_text("{")
     before = snapshot(tmp_path)
     for name, code, sentence in [
-        ("file", 4, "cannot be written"),
-        ("file/below", 4, "cannot be written"),
+        ("file", 4, "a file is in the way"),
+        ("file/below", 4, "a file is in the way"),
         ("folder", 2, "not a dataset, and not empty (it holds thesis.txt)"),
         ("damaged", 3, "not a manifest"),
     ]:

@@ -310,8 +310,9 @@ for turn in range(10**9):
 
     def test_one_build_at_a_time(self, tmp_path: Path) -> None:
         place = tmp_path / "new"
-        with self.store(place).exclusive() as abandoned:
-            assert not abandoned
+        with self.store(place).exclusive() as claim:
+            assert claim.abandoned == ()
+            claim.announce("height")
             with (
                 pytest.raises(StorageError, match=rf"another build is writing here \(process {os.getpid()}\)"),
                 self.store(place).exclusive(),
@@ -319,24 +320,32 @@ for turn in range(10**9):
                 pass
             assert self.store(place).keys("") == []
         assert not place.exists()
-        with self.store(place).exclusive() as abandoned:
-            assert not abandoned
+        with self.store(place).exclusive() as claim:
+            assert claim.abandoned == ()
             self.store(place).write("a", b"x")
         assert [path.name for path in place.iterdir()] == ["a"]
 
-    def test_the_lock_of_a_killed_build_does_not_last(self, tmp_path: Path) -> None:
+    def test_what_a_killed_build_announced_is_known_to_the_next(self, tmp_path: Path) -> None:
         program = f"""
 import os, signal
 from pathlib import Path
 from tiler.stores.directory import DirectoryStore
-with DirectoryStore(Path({str(tmp_path)!r})).exclusive():
+with DirectoryStore(Path({str(tmp_path)!r})).exclusive() as claim:
+    claim.announce("height.2", "height")
     os.kill(os.getpid(), signal.SIGKILL)
 """
         assert subprocess.run([sys.executable, "-c", program], check=False, timeout=60).returncode == -signal.SIGKILL
-        with self.store(tmp_path).exclusive() as abandoned:
-            assert abandoned
-        with self.store(tmp_path).exclusive() as abandoned:
-            assert not abandoned
+        with self.store(tmp_path).exclusive() as claim:
+            assert claim.abandoned == ("height.2", "height")
+        with self.store(tmp_path).exclusive() as claim:
+            assert claim.abandoned == ()
+
+    @pytest.mark.parametrize("content", ["", "1234", "clipmap build", "clipmap build\n12\n../../etc\n/\n", "\x00\xff" * 40])
+    def test_a_lock_file_of_someone_else_announces_nothing(self, content: str, tmp_path: Path) -> None:
+        """2026-11-22: any file called .lock made a build take a foreign folder for its own leftovers, and delete them."""
+        (tmp_path / ".clipmap-lock").write_text(content)
+        with self.store(tmp_path).exclusive() as claim:
+            assert claim.abandoned == ()
 
 
 @contextmanager

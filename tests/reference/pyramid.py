@@ -28,8 +28,8 @@ def coarsen(values: Array, coverage: Array | None, *, kernel: str, radius: int, 
     all 1. With weights w of the sharp and p of the positive kernel, W = sum w c, N = sum w c z, Wp = sum p c, P = sum p c z:
     the new coverage is Wp; the new value is 0 where Wp = 0, P / Wp where the share S = W / max c (largest c under the sharp taps)
     is at most 1/2, otherwise (1 - t) P / Wp + t N / W with ``t = guard_blend(S)``. Where every sample of non-zero weight has
-    coverage 1, W is exactly 1, as the sums of ``taps`` are exact, and the value is the plain sum. What lies under coverage 0 is ignored, even NaN. Raises ValueError for wrong shapes,
-    for coverage outside [0, 1] and for covered values that are not finite.
+    coverage 1, W is exactly 1, as the sums of ``taps`` are exact, and the value is the plain sum. What lies under coverage 0 is
+    ignored, even NaN. Raises ValueError for wrong shapes, for coverage outside [0, 1] and for covered values that are not finite.
     """
     sharp, positive = taps(kernel, radius, registration), positive_taps(registration)
     z, c = _checked(values, coverage)

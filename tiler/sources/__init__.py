@@ -10,6 +10,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.errors import InputError
 from schemas.manifest import Transform
 from schemas.region import Rect
 
@@ -86,3 +87,17 @@ class Reader(Protocol):
     def close(self) -> None:
         """Free handles and scratch files."""
         ...
+
+
+_TILE_LIMIT_BYTES = 512 << 20
+"""A tile is decoded as a whole, by every thread: a larger one is a mistake, or a header made to exhaust the memory."""
+
+
+def check_tile(path: Path, width: int, height: int, pixel_bytes: int) -> None:
+    """Raise InputError if one tile of a file takes more than 512 MiB to decode."""
+    tile_bytes = width * height * pixel_bytes
+    if tile_bytes > _TILE_LIMIT_BYTES:
+        raise InputError(
+            f"{path}: each of its tiles of {width} x {height} takes {tile_bytes / 1e9:.1f} GB to decode; "
+            "cut it into smaller ones first, e.g. with gdal_translate -co TILED=YES"
+        )

@@ -83,6 +83,10 @@ def _only_gdal_decodes(geographic: FileInfo, picture: FileInfo) -> bool:
 
 def _check_readable(path: Path) -> None:
     try:
+        str(path).encode("utf-8")
+    except UnicodeEncodeError as error:
+        raise InputError(f"{str(path)!a}: the name is not UTF-8, and GDAL cannot open such files; rename it") from error
+    try:
         if path.is_dir():
             raise InputError(f"{path}: is a folder; give one image or elevation file")
         if path.exists() and not path.is_file():

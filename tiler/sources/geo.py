@@ -16,7 +16,7 @@ from rasterio.windows import Window
 
 from schemas.errors import InputError
 from schemas.region import Rect
-from tiler.sources import FileInfo, Georeference, Layout, Pixels
+from tiler.sources import FileInfo, Georeference, Layout, Pixels, check_tile
 
 _UNITS = {"degree": "degree", "metre": "metre", "meter": "metre", "m": "metre", "foot": "foot", "us survey foot": "us-foot"}
 _FAILURES = (RasterioError, CPLE_BaseError, MemoryError)
@@ -57,6 +57,8 @@ def _info(path: Path, dataset: Any) -> FileInfo | None:  # noqa: ANN401
     layout: Layout = "tiled" if block_columns < dataset.width or block_rows >= dataset.height else "striped"
     dtype = np.dtype(dataset.dtypes[0])
     bits = int(dataset.tags(1, ns="IMAGE_STRUCTURE").get("NBITS", 8 * dtype.itemsize))
+    if dataset.driver == "GTiff" and block_columns < dataset.width:
+        check_tile(path, block_columns, block_rows, dataset.count * dtype.itemsize)
     structure = dataset.tags(ns="IMAGE_STRUCTURE")
     return FileInfo(
         path=path,

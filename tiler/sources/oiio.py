@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from schemas.errors import InputError
 from schemas.region import Rect
-from tiler.sources import FileInfo, Layout, Pixels
+from tiler.sources import FileInfo, Layout, Pixels, check_tile
 
 _RANDOM_ACCESS = {"tiff", "openexr"}
 _PREMULTIPLIED_BY_DEFAULT = {"tiff", "openexr"}
@@ -53,6 +53,7 @@ def describe(path: Path) -> FileInfo:
     tiled = spec.tile_width > 0
     chunk = spec.get_int_attribute("tiff:RowsPerStrip", 0) or spec.get_int_attribute("oiio:RowsPerChunk", 1)
     strip_rows = spec.tile_height if tiled else chunk
+    check_tile(path, spec.tile_width, spec.tile_height, spec.nchannels * dtype.itemsize)
     strip_bytes = strip_rows * spec.width * spec.nchannels * dtype.itemsize
     layout: Layout = "tiled" if tiled else "striped"
     if name not in _RANDOM_ACCESS or (not tiled and strip_bytes > _STRIP_LIMIT_BYTES):
@@ -98,6 +99,12 @@ class OiioReader:
 
     def read(self, window: Rect) -> tuple[Pixels, NDArray[np.uint8] | None]:
         """Return pixels (rows, columns, channels) and None; raises InputError if the file cannot be read there."""
+        try:
+            return self._read(window)
+        except MemoryError as error:
+            raise InputError(f"{self.info.path}: not enough memory to decode rows {window.y0} to {window.y1}") from error
+
+    def _read(self, window: Rect) -> tuple[Pixels, NDArray[np.uint8] | None]:
         handle = self._handle()
         spec = handle.spec()
         if spec.tile_width:
