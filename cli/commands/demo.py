@@ -9,6 +9,7 @@ from pathlib import Path
 
 import click
 
+from cli.commands.view import parse_size
 from schemas.errors import StorageError
 
 _URL_MARK = " at http://"
@@ -17,12 +18,15 @@ _URL_MARK = " at http://"
 @click.command(short_help="Build, serve and render a built-in terrain.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("demo"), show_default=True, help="Folder to work in.")
 @click.option("--side", type=click.IntRange(64, 8192), default=1024, show_default=True, help="Cells along an edge of the terrain.")
-@click.option("--size", default="1280x720", show_default=True, help="Size of the picture in pixels.")
-def command(output: Path, side: int, size: str) -> int:
+@click.option("--size", metavar="WxH", callback=parse_size, default="1280x720", show_default=True, help="Size of the picture in pixels.")
+def command(output: Path, side: int, size: tuple[int, int]) -> int:
     """Make an island, build a dataset of its heights and picture, serve it, and render it over HTTP to OUTPUT/demo.png.
 
     Every step is the command that is printed; try them yourself afterwards. Nothing is downloaded.
     """
+    from viewer.options import ViewOptions
+
+    ViewOptions(size=size)  # a size that the last step would refuse is refused before the first
     heights, picture = _sources(output / "source", side)
     dataset, image = output / "datasets" / "island", output / "demo.png"
     spacing = f"{20480 / side:g}"
@@ -35,7 +39,7 @@ def command(output: Path, side: int, size: str) -> int:
         if status := _run(step):
             return status
     with _served(dataset.parent) as url:
-        if status := _run(["view", f"{url}/{dataset.name}", "--headless", "--size", size, "--out", str(image)]):
+        if status := _run(["view", f"{url}/{dataset.name}", "--headless", "--size", f"{size[0]}x{size[1]}", "--out", str(image)]):
             return status
     click.echo(f"\nThe picture is {image}. Fly over it with: clipmap view {shlex.quote(str(dataset))}")
     return 0

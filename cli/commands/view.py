@@ -1,6 +1,7 @@
 """``clipmap view``: the reference client."""
 
 import math
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,21 +31,27 @@ def _numbers(_: click.Context, option: click.Parameter, value: str | None) -> tu
     return numbers
 
 
-def _size(_: click.Context, __: click.Parameter, value: str) -> tuple[int, int]:
-    """Return width and height in pixels."""
-    width, _cross, height = value.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal()):
+def parse_size(_: click.Context, __: click.Parameter, value: str) -> tuple[int, int]:
+    """Return width and height in pixels of ``1280x720``; a callback of click."""
+    found = re.fullmatch(r"(\d{1,9})x(\d{1,9})", value.lower())
+    if found is None:
         raise click.BadParameter(f"{value!r}: expected WIDTHxHEIGHT, e.g. 1280x720")
-    return int(width), int(height)
+    return int(found[1]), int(found[2])
 
 
 @click.command(name="view")
 @click.argument("dataset", metavar="DATASET_OR_URL")
 @click.option("--headless", is_flag=True, help="Draw without a window, into PNG files. --out implies it.")
-@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="PNG to write; with --frames a pattern: frame_%04d.png.")
-@click.option("--frames", type=click.IntRange(min=1), default=1, show_default=True, help="Pictures to take on a circle around the view.")
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="PNG to write; %d or %04d is the frame's number.")
 @click.option(
-    "--size", metavar="WxH", callback=_size, default="1280x720", show_default=True, help="Size of the picture or window in pixels."
+    "--frames",
+    type=click.IntRange(min=1),
+    default=1,
+    show_default=True,
+    help="Pictures to take on a circle around the view; numbered _0000, _0001, ... unless --out says where the number goes.",
+)
+@click.option(
+    "--size", metavar="WxH", callback=parse_size, default="1280x720", show_default=True, help="Size of the picture or window in pixels."
 )
 @click.option("--view", metavar="X,Y,Z,YAW,PITCH", callback=_numbers, help="World position X, Y, metres Z, degrees from north and up.")
 @click.option("--look-at", metavar="X,Y", callback=_numbers, help="World position to look at from a place chosen for it.")
@@ -80,6 +87,7 @@ def command(dataset: str, **given: Any) -> None:  # noqa: ANN401 - click passes 
     """
     view_options = _options(given)
     _require_moderngl()
+    paths = _picture_paths(dataset, given)
     from viewer.scene import open_scene
     from viewer.source import open_source
 
@@ -89,8 +97,8 @@ def command(dataset: str, **given: Any) -> None:  # noqa: ANN401 - click passes 
         try:
             scene.load_coarsest()
             camera = _camera(scene, view_options, given["view"], given["look_at"])
-            if given["headless"] or given["out"] is not None:
-                _render(scene, view_options, camera, given["out"] or Path(_default_name(dataset)), given["frames"], given["as_json"])
+            if paths:
+                _render(scene, view_options, camera, paths, given["as_json"])
             else:
                 _open_window(scene, view_options, camera, dataset)
         finally:
@@ -128,26 +136,35 @@ def _require_moderngl() -> None:
         raise MissingExtraError("viewing needs moderngl: pip install 'clipmap[view]'")
 
 
+def _picture_paths(dataset: str, given: dict[str, Any]) -> list[Path]:
+    """Return the pictures to write, none if a window is wanted."""
+    from viewer.gl.headless import frame_paths
+
+    if given["out"] is None and not given["headless"]:
+        return []
+    return frame_paths(given["out"] or Path(_default_name(dataset)), given["frames"])
+
+
 def _default_name(dataset: str) -> str:
-    return f"{Path(dataset.rstrip('/')).name or 'view'}.png"
+    """Return the file name for a dataset's picture; a % of its URL would mark the place of a number."""
+    return f"{Path(dataset.rstrip('/')).name.replace('%', '_') or 'view'}.png"
 
 
 def _camera(
     scene: "Scene", options: "ViewOptions", view: tuple[float, float, float, float, float] | None, look_at: tuple[float, float] | None
 ) -> "Camera":
-    from viewer.framing import camera_at, default_camera
+    from viewer.framing import camera_at, default_camera, place_at
 
     if view is not None:
         return camera_at(scene, view, options.fov_deg)
-    target = None if look_at is None else scene.frame.local_of_world(*look_at)
+    target = None if look_at is None else place_at(scene, *look_at)
     return default_camera(scene, options, target)
 
 
-def _render(scene: "Scene", options: "ViewOptions", camera: "Camera", out: Path, frames: int, as_json: bool) -> None:
+def _render(scene: "Scene", options: "ViewOptions", camera: "Camera", paths: list[Path], as_json: bool) -> None:
     from viewer.framing import view_text
-    from viewer.gl.headless import HeadlessView, frame_paths, render_frames
+    from viewer.gl.headless import HeadlessView, render_frames
 
-    paths = frame_paths(out, frames)
     view = HeadlessView(scene, options)
     pictures = list(render_frames(view, scene, camera, paths, options.exaggeration))
     result = {

@@ -21,6 +21,15 @@ _METRES: Final = {"metre": 1.0, "foot": 0.3048, "us-foot": 1200 / 3937, "unknown
 _METRES_PER_DEGREE: Final = 111_320.0
 """Length of a degree of the equator [m], used only where the manifest does not give the ground spacing."""
 
+_STEPS: Final = (1e-12, 1e12)
+"""Least and greatest distance between samples, in world units and in metres: beyond any survey, far within float64's range."""
+_FLAT: Final = 1e-9
+"""Area of a cell as a part of what its sides would span at right angles, below which the plane is squeezed onto a line."""
+_FAR: Final = 2.0**52
+"""Distance from the origin [samples] beyond which float64 cannot tell two neighbouring samples apart."""
+_RATIO: Final = 2.0**24
+"""Greatest ratio between the spacings of heights and imagery."""
+
 
 @dataclass(frozen=True)
 class Affine:
@@ -42,10 +51,15 @@ class Affine:
 
     def inverse(self) -> "Affine":
         """Return the inverse map; raises InputError if there is none."""
-        if not math.isfinite(np.linalg.cond(self.linear)) or np.linalg.det(self.linear) == 0.0:
+        if abs(float(np.linalg.det(self.linear))) <= _FLAT * math.prod(self.steps):
             raise InputError("the layer's transform squeezes the plane onto a line; rebuild the layer")
         linear = np.asarray(np.linalg.inv(self.linear), np.float64)
         return Affine(linear, -linear @ self.offset)
+
+    @property
+    def steps(self) -> tuple[float, float]:
+        """Lengths of a step along x and of one along y."""
+        return math.hypot(*self.linear[:, 0]), math.hypot(*self.linear[:, 1])
 
     def after(self, first: "Affine") -> "Affine":
         """Return the map that applies ``first``, then this one."""
@@ -78,11 +92,27 @@ class LocalFrame:
 
 
 def local_frame(layer: Layer, world: World) -> LocalFrame:
-    """Return the frame in which ``layer``'s samples lie ``ground_spacing_m`` apart; world units are used if that is not known."""
-    to_world = Affine.of(layer.transform)
+    """Return the frame in which ``layer``'s samples lie ``ground_spacing_m`` apart; world units are used if that is not known.
+
+    Raises InputError if no survey can have such samples: too near, too far apart, on a line, or too far from the origin.
+    """
+    to_world = _placed(layer)
     scale = _metres_per_unit(layer, world, to_world)
     linear = np.diag(scale) @ to_world.linear
     return LocalFrame(to_world, Affine(linear, np.zeros(2)))
+
+
+def _placed(layer: Layer) -> Affine:
+    """Return the map from the layer's samples to the world; raises InputError if nothing can be drawn with it."""
+    to_world = Affine.of(layer.transform)
+    low, high = _STEPS
+    for steps, unit in ((to_world.steps, "world units"), (layer.ground_spacing_m or (), "metres")):
+        for step in steps:
+            if not low <= step <= high:
+                raise InputError(f"the {layer.kind} layer's samples lie {step:g} {unit} apart, which cannot be drawn; rebuild the layer")
+    if max(np.abs(to_world.inverse().offset)) > _FAR:
+        raise InputError(f"the {layer.kind} layer's transform puts it too far from the world's origin to tell samples apart; rebuild it")
+    return to_world
 
 
 def _metres_per_unit(layer: Layer, world: World, to_world: Affine) -> Matrix:
@@ -107,12 +137,16 @@ def texel_map(heights: LocalFrame, imagery: Layer) -> Affine:
     """Return the map from height samples to level-0 texel coordinates of ``imagery``.
 
     Texel coordinates are those of a texture: texel i reaches from i to i + 1. A point-registered layer's sample i is the
-    middle of its texel on level 0; coarser levels of such a layer go through ``level_texel``.
+    middle of its texel on level 0; coarser levels of such a layer go through ``level_texel``. Raises InputError if the
+    imagery lies elsewhere, or so much finer or coarser than the heights that the two do not belong together.
     """
-    to_texel = Affine.of(imagery.transform).inverse()
+    to_texel = _placed(imagery).inverse()
     if imagery.registration == "point":
         to_texel = Affine(to_texel.linear, to_texel.offset + 0.5)
-    return to_texel.after(heights.to_world)
+    both = to_texel.after(heights.to_world)
+    if max(np.abs(both.offset)) > _FAR or not all(1 / _RATIO <= step <= _RATIO for step in both.steps):
+        raise InputError("imagery and heights differ too much in place or spacing to be drawn together; rebuild one of them")
+    return both
 
 
 def level_texel(texel: float, level: int, registration: str) -> float:

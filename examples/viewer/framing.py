@@ -1,6 +1,7 @@
 """Choosing a view when none is given, and circling what a view shows. All of it is deterministic."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -19,6 +20,8 @@ PROMINENT: Final = 0.4
 """Height of the summit above the middle height around it, as a part of the relief, from which it counts as a mountain."""
 NEARER: Final = np.array([1.0, 0.75, 0.55, 0.4])
 """Parts of the best distance that are tried until a view has ground below it."""
+FARTHEST: Final = 1e6
+"""Distance of a view from the dataset, as a multiple of the dataset's size, beyond which not a pixel of it is seen."""
 OVERVIEW: Final = math.radians(50)
 """Elevation from which a dataset is seen as a whole."""
 
@@ -170,12 +173,29 @@ def orbit(camera: Camera, centre: Vector, turn_deg: float) -> Camera:
     return moved.turned(turn_deg, 0.0)
 
 
+def place_at(scene: Scene, x: float, y: float) -> tuple[float, float]:
+    """Return local metres of a world position; raises UsageError if nothing of the dataset could be seen from there."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        place = scene.frame.local_of_world(x, y)
+    _check_near(scene, place, f"{x:g},{y:g}")
+    return place
+
+
+def _check_near(scene: Scene, lengths_m: Iterable[float], where: str) -> None:
+    extent = scene.heights.extent(0)
+    side_m = max(extent.width, extent.height) * max(scene.frame.to_local.steps)
+    farthest_m = FARTHEST * (side_m + max(map(abs, scene.z_range_m)))
+    if not all(abs(length) <= farthest_m for length in lengths_m):
+        raise UsageError(f"{where}: more than a million times as far away as the dataset is large; positions are world coordinates")
+
+
 def camera_at(scene: Scene, view: tuple[float, float, float, float, float], fov_deg: float) -> Camera:
     """Return the camera of a view (world x, world y, metres z, yaw, pitch in degrees); raises UsageError if it is out of range."""
     x, y, z_m, yaw_deg, pitch_deg = view
     if not -90.0 <= pitch_deg <= 90.0:
         raise UsageError(f"view pitch {pitch_deg:g}: must be from -90 (down) to 90 (up) degrees")
-    x_m, y_m = scene.frame.local_of_world(x, y)
+    x_m, y_m = place_at(scene, x, y)
+    _check_near(scene, [z_m], f"view height {z_m:g} m")
     return Camera(x_m, y_m, z_m, yaw_deg % 360.0, pitch_deg, fov_deg)
 
 

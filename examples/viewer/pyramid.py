@@ -105,7 +105,26 @@ def _replicated(area: Rect, rect: Rect) -> tuple[NDArray[np.intp], NDArray[np.in
     return rows.astype(np.intp), columns.astype(np.intp)
 
 
-class BlockHeights:
+class _HalvedLevels:
+    """The levels of given ``sizes`` (width, height), and halved ones after them until one is at most ``coarsest`` samples on a side."""
+
+    def __init__(self, sizes: list[tuple[int, int]], coarsest: int) -> None:
+        self._sizes = sizes.copy()
+        while max(self._sizes[-1]) > coarsest:
+            width, height = self._sizes[-1]
+            self._sizes.append((-(-width // 2), -(-height // 2)))
+
+    @property
+    def levels(self) -> int:
+        """Number of levels, those beyond the given ones included."""
+        return len(self._sizes)
+
+    def extent(self, level: int) -> Rect:
+        """The samples that exist on ``level``."""
+        return Rect(0, 0, *self._sizes[level])
+
+
+class BlockHeights(_HalvedLevels):
     """The heights of a layer, with levels beyond its last one until a level has at most ``coarsest`` samples on a side.
 
     Beyond the last stored level every second sample of it is taken: point registration puts coarse sample i on fine sample
@@ -118,19 +137,7 @@ class BlockHeights:
         self._gradient = gradient
         lattice = self._assembler.lattice
         self._stored_levels = lattice.levels
-        self._sizes = [lattice.level_size(level) for level in range(lattice.levels)]
-        while max(self._sizes[-1]) > coarsest:
-            width, height = self._sizes[-1]
-            self._sizes.append((-(-width // 2), -(-height // 2)))
-
-    @property
-    def levels(self) -> int:
-        """Number of levels, those beyond the stored ones included."""
-        return len(self._sizes)
-
-    def extent(self, level: int) -> Rect:
-        """The samples that exist on ``level``."""
-        return Rect(0, 0, *self._sizes[level])
+        super().__init__([lattice.level_size(level) for level in range(lattice.levels)], coarsest)
 
     def needs(self, level: int, rect: Rect) -> list[BlockKey]:
         """Return the stored blocks under ``rect`` and the samples next to it, which its slopes need."""
@@ -175,23 +182,11 @@ class BlockHeights:
         return z[np.ix_(rows, columns)], valid[np.ix_(rows, columns)]
 
 
-class FlatHeights:
+class FlatHeights(_HalvedLevels):
     """Heights of 0 on a lattice of ``width`` x ``height`` samples: the ground under imagery that has no heights."""
 
     def __init__(self, width: int, height: int, coarsest: int) -> None:
-        self._sizes = [(width, height)]
-        while max(self._sizes[-1]) > coarsest:
-            width, height = self._sizes[-1]
-            self._sizes.append((-(-width // 2), -(-height // 2)))
-
-    @property
-    def levels(self) -> int:
-        """Number of levels."""
-        return len(self._sizes)
-
-    def extent(self, level: int) -> Rect:
-        """The samples that exist on ``level``."""
-        return Rect(0, 0, *self._sizes[level])
+        super().__init__([(width, height)], coarsest)
 
     def needs(self, level: int, rect: Rect) -> list[BlockKey]:
         """Nothing is ever needed."""

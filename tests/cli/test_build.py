@@ -142,7 +142,7 @@ FAILURES: list[tuple[str, list[str], int, str]] = [
     ("five", [], 2, "has 5 channels; choose 1 or 3 with --bands"),
     ("five", ["--bands", "6"], 2, "no channel 6, it has 5"),
     ("five", ["--bands", "1,2,3,4,5"], 2, "--bands"),
-    ("five", ["--bands", "0"], 2, "bands are counted from 1"),
+    ("five", ["--bands", "0"], 2, "channels are counted from 1"),
     ("five", ["--bands", "one"], 2, "channel numbers from 1, separated by commas"),
     ("grey8", [], 2, "say --layer imagery or --layer height"),
     ("grey8", ["--layer", "relief"], 2, "'relief'"),

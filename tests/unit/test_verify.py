@@ -324,10 +324,7 @@ def test_records_that_contradict_the_samples(change: dict[str, float], what: str
 
 @pytest.mark.parametrize("codec", ["png16:0.01,0", "lerc:0.01"])
 def test_overshoot_is_recorded_as_readers_see_it(codec: str, tmp_path: Path) -> None:
-    """Beside a cliff over the codec's whole range a windowed sinc overshoots; what does not fit is clipped, in the index too.
-
-    2026-11-22: the index had heights that no reader of a png16 block could get.
-    """
+    """2026-11-22: beside a cliff over its whole range, the index of png16 had overshoot that no reader could get."""
     cliff = np.where(np.arange(128) < 64, 0.0, 655.35).astype(np.float32)
     source = write_tiff(tmp_path / "cliff.tif", np.broadcast_to(cliff, (96, 128))[..., np.newaxis].copy())
     build_layer(source, tmp_path / "out", settings(codec=codec, pad=1))

@@ -72,3 +72,52 @@ def test_levels_halve_about_corners_or_about_samples() -> None:
 def test_a_degenerate_transform_is_refused() -> None:
     with pytest.raises(InputError, match="onto a line"):
         Affine.of((1.0, 2.0, 0.0, 2.0, 4.0, 0.0)).inverse()
+
+
+@pytest.mark.parametrize("spacing", [None, (10.0, 10.0)])
+@pytest.mark.parametrize(
+    ("transform", "words"),
+    [
+        ((1e308, 0.0, 0.0, 0.0, -1e308, 0.0), "height layer's samples lie 1e+308 world units apart"),
+        ((1e-320, 0.0, 0.0, 0.0, -1e-320, 0.0), "height layer's samples lie 9.99989e-321 world units apart"),
+        ((1e308, 1e308, 0.0, 1e308, -1e308, 0.0), "height layer's samples lie 1.41421e+308 world units apart"),
+        ((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), "height layer's samples lie 0 world units apart"),
+        ((10.0, 0.0, 0.0, 0.0, -1e200, 0.0), "height layer's samples lie 1e+200 world units apart"),
+        ((1.0, 2.0, 0.0, 2.0, 4.0, 0.0), "onto a line"),
+        ((1.0, 1.0, 0.0, 1.0, 1.0 + 1e-15, 0.0), "onto a line"),
+        ((10.0, 0.0, 1e308, 0.0, -10.0, 0.0), "too far from the world's origin"),
+    ],
+)
+def test_absurd_transforms_are_refused(transform: Transform, words: str, spacing: tuple[float, float] | None) -> None:
+    """2026-11-22: these raised LinAlgError, ZeroDivisionError or RuntimeWarning."""
+    layer, _ = build_layer(heights(transform, spacing))
+    with pytest.raises(InputError) as caught:
+        local_frame(layer, METRE)
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize("spacing", [(1e308, 1.0), (1.0, 1e-320), (0.0, 1.0), (1.0, -1.0)])
+def test_absurd_ground_spacings_are_refused(spacing: tuple[float, float]) -> None:
+    """2026-11-22: like absurd transforms."""
+    layer, _ = build_layer(heights((10.0, 0.0, 0.0, 0.0, -10.0, 0.0), spacing))
+    with pytest.raises(InputError, match="metres apart, which cannot be drawn"):
+        local_frame(layer, METRE)
+
+
+@pytest.mark.parametrize("step", [1e-12, 1e12])
+def test_the_least_and_the_greatest_spacing_have_a_frame(step: float) -> None:
+    for spacing in (None, (step, step)):
+        layer, _ = build_layer(heights((step, 0.0, 0.0, 0.0, -step, 0.0), spacing))
+        frame = local_frame(layer, METRE)
+        assert frame.spacing_m == pytest.approx(step)
+        assert frame.sample_at(*frame.to_local(7, 9)) == pytest.approx((7, 9))
+
+
+@pytest.mark.parametrize("place", [(1e12, 0.0, 0.0), (1e-12, 0.0, 0.0), (2.5, 0.0, 1e17)])
+def test_imagery_that_has_nothing_to_do_with_the_heights_is_refused(place: tuple[float, float, float]) -> None:
+    """2026-11-22: texel coordinates beyond 64 bits raised OverflowError."""
+    height, _ = build_layer(heights((10.0, 0.0, 500.0, 0.0, -10.0, 900.0), None))
+    step, turn, x = place
+    image, _ = build_layer(LayerSpec("imagery", "imagery", np.zeros((40, 40, 3), np.uint8), (step, turn, x, turn, -step, 0.0)))
+    with pytest.raises(InputError, match=r"too much in place or spacing|too far from the world's origin"):
+        texel_map(local_frame(height, METRE), image)

@@ -123,6 +123,16 @@ def test_flat_ground_ends_with_its_lattice() -> None:
     assert not slopes.any()
 
 
+def test_levels_beyond_the_stored_ones_halve_alike_with_and_without_heights(scene: Scene) -> None:
+    """2026-11-22: the two kinds of heights each had their own copy of this rule."""
+    flat = FlatHeights(70, 45, OPTIONS.grid // 4)
+    assert scene.manifest.layer("height").lattice.levels == 4
+    assert [scene.heights.extent(level) for level in range(scene.heights.levels)] == [flat.extent(level) for level in range(flat.levels)]
+    assert [flat.extent(level).width for level in range(flat.levels)] == [70, 35, 18, 9, 5, 3]
+    assert [flat.extent(level).height for level in range(flat.levels)] == [45, 23, 12, 6, 3, 2]
+    scene.close()
+
+
 def test_a_coarse_level_that_ends_early_is_drawn_to_the_edge(scene: Scene) -> None:
     # 70 x 45 samples: level 1 has 35 columns, the last at 68, so a 36th at 70 covers column 69; row 44 is row 22 of level 1.
     rect = Rect(33, 20, 38, 25)

@@ -1,3 +1,4 @@
+import errno
 import json
 from pathlib import Path
 
@@ -6,7 +7,9 @@ import moderngl
 import numpy as np
 import pytest
 
+from cli.commands import view
 from cli.main import run
+from schemas.errors import StorageError
 from tests.viewer.scenes import rough
 from tests.viewer.writer import LayerSpec, write_dataset
 from viewer.gl import headless
@@ -76,11 +79,15 @@ def test_frames_go_round(dataset: Path, tmp_path: Path) -> None:
         (["--view", "1,2,3,4,nan"], 2, "expected numbers"),
         (["--view", "1,2,3,4,5", "--look-at", "1,2"], 2, "give one of them"),
         (["--sun", "0,100"], 2, "from -90 to 90"),
+        (["--view", "1e300,0,1000,0,-30"], 2, "1e+300,0: more than a million times as far away"),
+        (["--view", "0,0,1e300,0,-90"], 2, "view height 1e+300 m: more than a million times"),
+        (["--look-at", "-1e308,1e308"], 2, "-1e+308,1e+308: more than a million times"),
         (["--exaggeration", "0"], 2, "greater than 0"),
         (["--haze", "-1"], 2, "positive distance"),
         (["--samples", "64"], 2, "at most"),
         (["--out", "x.jpg"], 2, "ends in .png"),
-        (["--out", "x.png", "--frames", "2"], 2, "frame_%04d.png"),
+        (["--size", "9" * 5000 + "x100"], 2, "expected WIDTHxHEIGHT"),
+        (["--out", "x_%s.png", "--frames", "2"], 2, "give it once, as %d or %04d"),
         (["--height", "imagery"], 2, "is of kind imagery, not height"),
         (["--imagery", "nothing"], 3, "no layer 'nothing'"),
         (["--out", "/nowhere/x.png"], 4, "cannot be written"),
@@ -132,6 +139,89 @@ def test_a_missing_moderngl_is_told_how_to_get(dataset: Path, capsys: pytest.Cap
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     assert run(["view", str(dataset), "--headless"]) == 2
     assert "pip install 'clipmap[view]'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["%s.png", "%x.png", "%.png", "50%.png", "%%d.png", "%d_%d.png", "%4d.png", "%-3d.png", "%0999999999d.png", "%(a)d.png", "%20s.png"],
+)
+@pytest.mark.parametrize("frames", [1, 3])
+def test_only_numbers_have_a_place_in_names(
+    name: str, frames: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """2026-11-22: %x, %20s and the like were taken, and an impossible width ended in a MemoryError after the dataset was loaded."""
+    monkeypatch.setattr("viewer.source.open_source", lambda *_: pytest.fail("the dataset was opened"))
+    assert run(["view", str(tmp_path), "--out", str(tmp_path / name), "--frames", str(frames)]) == 2
+    assert "a % in the name marks the place of the frame's number; give it once, as %d or %04d" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_frames_without_a_place_are_numbered_at_the_end() -> None:
+    """2026-11-22: they were refused once everything was loaded."""
+    assert headless.frame_paths(Path("a%s/b.c.PNG"), 2) == [Path("a%s/b.c_0000.PNG"), Path("a%s/b.c_0001.PNG")]
+    assert headless.frame_paths(Path("%d.png"), 11)[10] == Path("10.png")
+    assert headless.frame_paths(Path("b_%010d.png"), 1) == [Path("b_0000000000.png")]
+
+
+@pytest.mark.parametrize(
+    ("dataset", "name"), [("a/b/", "b.png"), ("http://h/my%20set", "my_20set.png"), ("/", "view.png"), ("50%d", "50_d.png")]
+)
+def test_pictures_are_called_after_the_dataset(dataset: str, name: str) -> None:
+    """2026-11-22: a % in a URL was taken for the place of a frame's number."""
+    assert view._default_name(dataset) == name
+
+
+def test_a_picture_appears_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """2026-11-22: a full disk left half a picture where a whole one had been."""
+    out, pixels = tmp_path / "x.png", np.zeros((4, 4, 3), np.uint8)
+    headless.write_png(out, pixels)
+    whole = out.read_bytes()
+    put = Path.write_bytes
+
+    def full(path: Path, data: bytes) -> int:
+        put(path, data[:20])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(StorageError, match=r"x\.png: cannot be written: No space left on device"):
+        headless.write_png(out, pixels + 1)
+    monkeypatch.setattr(Path, "write_bytes", put)
+
+    def interrupted(*_: Path) -> Path:
+        assert [path.parent for path in tmp_path.iterdir()] == [tmp_path, tmp_path]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "replace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        headless.write_png(out, pixels + 1)
+    assert out.read_bytes() == whole
+    assert [path.name for path in tmp_path.iterdir()] == ["x.png"]
+
+
+def test_a_rebuilt_or_confused_dataset_ends_in_a_sentence(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """2026-11-22: a block copied over another of the same layer was drawn where it does not belong."""
+    finest = sorted((dataset / "height" / "0").glob("*.raw"))
+    for block in finest[1:]:
+        block.write_bytes(finest[0].read_bytes())
+    assert run(["view", str(dataset), "--out", str(tmp_path / "x.png"), "--size", "64x48"]) == 3
+    message = capsys.readouterr().err
+    assert "holds other bytes than the index says" in message
+    assert "height-0-" in message
+    assert message.count("\n") == 1
+
+
+@pytest.mark.parametrize("step", [1e308, 1e-320])
+@pytest.mark.parametrize("spacing", [None, (30.0, 30.0)])
+def test_an_absurd_spacing_ends_in_a_sentence(
+    step: float, spacing: tuple[float, float] | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """2026-11-22: LinAlgError and ZeroDivisionError."""
+    place = (step, 0.0, 0.0, 0.0, -step, 0.0)
+    write_dataset(tmp_path / "d", [LayerSpec("height", "height", np.zeros((20, 20), np.float32), place, ground_spacing_m=spacing)])
+    assert run(["view", str(tmp_path / "d"), "--out", str(tmp_path / "x.png")]) == 3
+    message = capsys.readouterr().err
+    assert "world units apart, which cannot be drawn" in message
+    assert message.count("\n") == 1
 
 
 def test_pictures_are_numbered() -> None:

@@ -1,9 +1,13 @@
 """Pictures without a window: every wanted block is loaded before a frame is drawn, so pictures are reproducible."""
 
+import os
+import re
+import secrets
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import imagecodecs
 import moderngl
@@ -21,6 +25,9 @@ from viewer.scene import WAIT_S, Scene
 
 Pixels = NDArray[np.uint8]
 """A picture, (height, width, 3), top row first."""
+
+_NUMBER: Final = re.compile(r"%(0[1-9]\d?)?d")
+"""The place of a frame's number in a file name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,21 +113,20 @@ class HeadlessView:
 
 
 def frame_paths(out: Path, frames: int) -> list[Path]:
-    """Return the files of ``frames`` pictures; ``out`` must have a place for the number, like frame_%04d.png, if there are several.
+    """Return the files of ``frames`` pictures: their number stands where ``out`` has %d or %0Nd, else, if there are several, at the end.
 
-    Raises UsageError.
+    Raises UsageError if ``out`` is no PNG or has another % in its name.
     """
     if frames < 1:
         raise UsageError(f"frames {frames}: must be at least 1")
     if out.suffix.lower() != ".png":
         raise UsageError(f"{out}: pictures are written as PNG; give a name that ends in .png")
-    try:
-        paths = [out.with_name(out.name % number) for number in range(frames)] if "%" in out.name else [out]
-    except (TypeError, ValueError):
-        raise UsageError(f"{out}: the place for the frame's number must look like %04d") from None
-    if len(set(paths)) != frames:
-        raise UsageError(f"{out}: {frames} frames need a place for their number in the name, like frame_%04d.png")
-    return paths
+    pattern = out.name if frames == 1 or "%" in out.name else f"{out.stem}_%04d{out.suffix}"
+    if "%" not in pattern:
+        return [out]
+    if pattern.count("%") > 1 or not _NUMBER.search(pattern):
+        raise UsageError(f"{out}: a % in the name marks the place of the frame's number; give it once, as %d or %04d")
+    return [out.with_name(pattern % number) for number in range(frames)]
 
 
 def render_frames(view: HeadlessView, scene: Scene, camera: Camera, paths: list[Path], exaggeration: float) -> Iterator[Picture]:
@@ -138,8 +144,15 @@ def render_frames(view: HeadlessView, scene: Scene, camera: Camera, paths: list[
 
 
 def write_png(path: Path, pixels: Pixels) -> None:
-    """Write a picture; raises StorageError."""
+    """Write a picture in one step, so that nobody sees a part of one; raises StorageError."""
+    data = imagecodecs.png_encode(pixels, level=6)
+    temporary = path.with_name(f".tmp-{os.getpid()}-{secrets.token_hex(4)}.png")
     try:
-        path.write_bytes(imagecodecs.png_encode(pixels, level=6))
+        try:
+            temporary.write_bytes(data)
+            temporary.replace(path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
     except OSError as error:
         raise StorageError(f"{path}: cannot be written: {error.strerror}") from error
