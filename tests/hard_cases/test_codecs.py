@@ -82,6 +82,17 @@ def test_c69_one_damaged_block_leaves_the_others_readable(spec: str, tmp_path: P
     assert decode(dataset, "height", BlockAddress(0, 0, 1))[1].all()
 
 
+@pytest.mark.parametrize("codec", ["lerc:0.01", "exr:float", "png16:0.1,-1000"])
+def test_c70_same_bytes_from_any_number_of_threads(codec: str, tmp_path: Path) -> None:
+    """One thread, two, five, tasks in another order: the same digests."""
+    source = write_tiff(tmp_path / "terrain.tif", terrain(200, 200).astype(np.float32))
+    versions = {
+        build_layer(source, tmp_path / f"out{number}", settings(codec=codec, workers=workers, task=task)).manifest.version
+        for number, (workers, task) in enumerate(((1, 64), (2, 64), (5, 64), (2, 4096)))
+    }
+    assert len(versions) == 1
+
+
 def test_c71_lossy_borders_agree_within_the_bound(tmp_path: Path) -> None:
     """Two blocks that store the same border sample decode to heights at most two error bounds apart: no cracks beyond that."""
     bound = 0.5

@@ -166,6 +166,15 @@ def test_c28_more_than_two_to_the_32_samples(tmp_path: Path, monkeypatch: pytest
         rows.close()
 
 
+@pytest.mark.parametrize(("linear_light", "expected"), [(False, 128), (True, 188)])
+def test_c61_gamma(linear_light: bool, expected: int) -> None:
+    """A black and white 2 x 2 pattern: 188 as light, 128 as codes."""
+    codes = np.array([[0, 255], [255, 0]], np.float32)[..., np.newaxis]
+    values = np.where(codes > 0, np.float32(1), np.float32(0)) if linear_light else codes
+    coarse = run_cascade(values, None, levels=2, kind="imagery", radius=1, name="box")[1][1]
+    assert round_samples(coarse, None, UINT8, linear_light)[0] == expected
+
+
 def test_c63_opaque_stays_opaque() -> None:
     """Alpha 255 everywhere is alpha 255 on every level: coverage is exactly 1, not 0.9999."""
     values = np.random.default_rng(3).uniform(0, 255, (60, 60, 3)).astype(np.float32)

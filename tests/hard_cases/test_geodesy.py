@@ -39,6 +39,21 @@ def test_c54_antimeridian_neighbours_are_neighbours() -> None:
     assert found[0] == pytest.approx(21.93, abs=0.01)
 
 
+def test_c55_across_the_pole() -> None:
+    """In polar stereographic (true at 70 N) a kilometre at the pole is 1031 m on the ground, along both axes, and the pole is no seam."""
+    found = ground_spacing_m((1000, 0, 0, 0, -1000, 0), "EPSG:3413", 0, 0)
+    assert found is not None
+    assert found == pytest.approx((found[0], found[0]), rel=1e-9)
+    assert found[0] == pytest.approx(1031.1, abs=0.5)
+
+
+def test_c56_nearly_antipodal_neighbours() -> None:
+    """Samples 179.5 degrees apart: the geodesic converges (iterations that start from a sphere do not), at most half around the Earth."""
+    found = ground_spacing_m((179.5, 0, 0, 0, -0.5, 0.25), "EPSG:4326", 0, 0)
+    assert found is not None
+    assert 19_900_000 < found[0] < 20_004_000
+
+
 def test_c57_southern_hemisphere_and_south_up() -> None:
     """Signs do not matter: the same spacing north and south of the equator, and with rows from south to north."""
     spacings = [ground_spacing_m((STEP, 0, 10, 0, sign * STEP, latitude), "EPSG:4326", 0, 0) for sign in (1, -1) for latitude in (45, -45)]
