@@ -94,6 +94,8 @@ class LevelFacts(LevelSummary):
 
     dataset: str
     layer: str
+    row_spacing_m: tuple[float, float] | None = Field(description="Smallest and largest ground distance of neighbours in a row [m]")
+    column_spacing_m: tuple[float, float] | None = Field(description="Smallest and largest ground distance of neighbours in a column [m]")
     min: float | None = Field(description="Smallest valid sample over all colour channels; null if none is valid")
     max: float | None
     valid: int = Field(description="Valid samples")

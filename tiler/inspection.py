@@ -70,10 +70,13 @@ def describe_level(dataset: Dataset, name: str, number: int, cells: int = 64) ->
     layer = dataset.manifest.layer(name)
     layer.lattice.level_size(number)
     stored = [record for record in dataset.index(name, number) if not record.blank]
+    footprint = measure_footprint(layer, dataset.manifest.world.crs)
     return LevelFacts(
         **_level_summary(layer, layer.levels[number]).model_dump(),
         dataset=dataset.store.location,
         layer=name,
+        row_spacing_m=None if footprint is None else _coarser(footprint.row_spacing_m, number),
+        column_spacing_m=None if footprint is None else _coarser(footprint.column_spacing_m, number),
         min=min((record.min for record in stored), default=None),
         max=max((record.max for record in stored), default=None),
         valid=sum(record.valid for record in stored),
@@ -81,6 +84,11 @@ def describe_level(dataset: Dataset, name: str, number: int, cells: int = 64) ->
         block_bytes_max=max((record.length_bytes for record in stored), default=None),
         coverage=_coverage_map(dataset, name, number, cells),
     )
+
+
+def _coarser(spacing_m: tuple[float, float], level: int) -> tuple[float, float]:
+    """Return a spacing of level 0 for ``level``, whose samples lie ``2**level`` times as far apart."""
+    return spacing_m[0] * 2**level, spacing_m[1] * 2**level
 
 
 def describe_block(dataset: Dataset, name: str, address: BlockAddress) -> tuple[BlockFacts, DecodedBlock | None]:
@@ -147,10 +155,9 @@ def parse_target(dataset: Dataset, target: str) -> tuple[str, int | None, BlockA
 
 def _level_summary(layer: Layer, level: Level) -> LevelSummary:
     spacing = layer.ground_spacing_m
-    scale = 2**level.level
     return LevelSummary(
         **level.model_dump(exclude={"availability", "index"}),
-        ground_spacing_m=None if spacing is None else (spacing[0] * scale, spacing[1] * scale),
+        ground_spacing_m=None if spacing is None else _coarser(spacing, level.level),
     )
 
 
