@@ -47,6 +47,10 @@ class Rect:
         """The same rectangle moved by ``(dx, dy)``."""
         return Rect(self.x0 + dx, self.y0 + dy, self.x1 + dx, self.y1 + dy)
 
+    def coarsened(self, levels: int) -> "Rect":
+        """The samples that stand for this rectangle ``levels`` levels coarser; the upper ends are rounded up."""
+        return Rect(self.x0 >> levels, self.y0 >> levels, -(-self.x1 >> levels), -(-self.y1 >> levels))
+
     def grown(self, margin: int) -> "Rect":
         """The rectangle with ``margin`` samples added on each side (removed, if negative)."""
         return Rect(self.x0 - margin, self.y0 - margin, self.x1 + margin, self.y1 + margin)

@@ -1,7 +1,7 @@
 """Building a layer: source, plan, tasks, manifest. The manifest is written last and in one step."""
 
 import resource
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -67,8 +67,8 @@ def build_layer(path: Path, output: Path, settings: BuildSettings, on_progress: 
     store = DirectoryStore(output)
     _refuse_inside(path, output)
     with store.exclusive() as claim:
+        _delete_unpublished(store, claim.abandoned)
         dataset = read_manifest(store)
-        _clear_abandoned(store, claim, dataset)
         if dataset is None:
             _refuse_foreign(output)
         reader = open_file(path, output, settings.max_samples)
@@ -133,10 +133,11 @@ def _refuse_foreign(output: Path) -> None:
         raise UsageError(f"{output}: not a dataset, and not empty (it holds {foreign[0]}); choose another folder for -o")
 
 
-def _clear_abandoned(store: DirectoryStore, claim: BuildClaim, dataset: Manifest | None) -> None:
-    """Delete what a killed build announced and did not publish, or replaced and did not get to delete."""
+def _delete_unpublished(store: DirectoryStore, prefixes: Sequence[str]) -> None:
+    """Delete of the announced ``prefixes`` what the manifest does not name: never finished, or replaced."""
+    dataset = read_manifest(store)
     published = set() if dataset is None else {layer.path for layer in dataset.layers.values()}
-    for prefix in claim.abandoned:
+    for prefix in prefixes:
         if prefix not in published:
             store.delete_prefix(prefix)
 
@@ -147,7 +148,8 @@ def _build(
     output = Path(store.location)
     replaced = dataset.layers[plan.name].path if dataset is not None and plan.name in dataset.layers else None
     path = _unused_path(plan.name, replaced, output)
-    claim.announce(path, *([replaced] if replaced else []))
+    announced = [path] if replaced is None else [path, replaced]
+    claim.announce(*announced)
     target = Target(store, path, plan.name, plan.lattice, plan.block, plan.codec, plan.linear_light)
     ledger = Ledger(plan.lattice, plan.source.conversion.channels, on_progress)
     try:
@@ -155,10 +157,9 @@ def _build(
         manifest = _publish(plan, target, ledger, dataset)
     except BaseException:
         with suppress(StorageError):
-            store.delete_prefix(path)
+            _delete_unpublished(store, announced)
         raise
-    if replaced:
-        store.delete_prefix(replaced)
+    _delete_unpublished(store, announced)
     return manifest, times
 
 

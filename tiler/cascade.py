@@ -43,8 +43,7 @@ def held_windows(size: tuple[int, int], core: Rect, pads: Sequence[int], reach: 
     windows: list[Rect] = []
     for level in range(levels - 1, -1, -1):
         whole = Rect(0, 0, *sizes[level])
-        share = Rect(core.x0 >> level, core.y0 >> level, -(-core.x1 >> level), -(-core.y1 >> level))
-        own = (share & whole).grown(pads[level]) & whole
+        own = (core.coarsened(level) & whole).grown(pads[level]) & whole
         if windows:
             seen = support(windows[-1], reach) & whole
             own = Rect(min(own.x0, seen.x0), min(own.y0, seen.y0), max(own.x1, seen.x1), max(own.y1, seen.y1))

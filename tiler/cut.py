@@ -135,8 +135,7 @@ class Cutter:
     def take(self, level: int, first: int, values: Values, coverage: Coverage | None, left: int) -> None:
         """Take rows ``first`` and following of ``level``, whose first column is ``left``."""
         lattice = self._target.lattice
-        shift = level - self._first_level
-        core = Rect(self._core.x0 >> shift, self._core.y0 >> shift, -(-self._core.x1 >> shift), -(-self._core.y1 >> shift))
+        core = self._core.coarsened(level - self._first_level)
         padded = core.grown(lattice.pad) & lattice.level_rect(level)
         rows, columns = slice(max(padded.y0 - first, 0), max(padded.y1 - first, 0)), slice(padded.x0 - left, padded.x1 - left)
         part, covered = values[rows, columns], None if coverage is None else coverage[rows, columns]

@@ -13,28 +13,12 @@ from schemas.errors import UsageError
 from schemas.manifest import digest
 from schemas.region import Rect
 from tests.integration.files import assemble, decode, settings, tree_digest, write_png, write_tiff
+from tests.levels import run_cascade
 from tests.reference.terrain import photo, terrain
 from tiler.build import build_layer
-from tiler.cascade import Cascade, Coverage, Recipe, Values, held_windows
 from tiler.codecs import BlockFormat
 from tiler.cut import round_samples
-from tiler.kernels import blackman_sinc
 from tiler.stores.dataset import open_dataset
-
-
-def whole_level(values: Values, coverage: Coverage | None, level: int, kind: str, radius: int) -> tuple[Values, Coverage | None]:
-    """Filter the whole picture in one piece and return one level."""
-    registration, edge = ("point", "antisymmetric") if kind == "height" else ("area", "mirror")
-    height, width, channels = values.shape
-    kernel = blackman_sinc(radius, registration)  # type: ignore[arg-type]
-    found: list[tuple[Values, Coverage | None]] = []
-    windows = held_windows((width, height), Rect(0, 0, width, height), [0] * (level + 1), kernel.reach)
-    recipe = Recipe(kernel, edge, coverage is not None)  # type: ignore[arg-type]
-    Cascade((width, height), windows, channels, recipe, lambda n, _, v, c: found.append((v, c)) if n == level else None).push(
-        values, coverage
-    )
-    coverages = [c for _, c in found if c is not None]
-    return np.concatenate([v for v, _ in found]), np.concatenate(coverages) if coverages else None
 
 
 @pytest.mark.parametrize("name", ["height", "photo"])
@@ -59,8 +43,9 @@ def test_no_seams(name: str, codec: str, height_tiff: Path, photo_tiff: Path, tm
         values = np.moveaxis(file.read(), 0, -1).astype(np.float32)
     coverage = np.isfinite(values[..., 0]).astype(np.float32) if name == "height" else None
     values = np.nan_to_num(values)
+    whole = run_cascade(values, coverage, levels=len(layer.levels), kind=layer.kind, radius=layer.filter.radius)
     for level in range(len(layer.levels)):
-        expected, covered = whole_level(values, coverage, level, layer.kind, layer.filter.radius)
+        _, expected, covered = whole[level]
         rounded, mask = round_samples(expected, covered, BlockFormat(layer.kind, 32, layer.channels, layer.dtype))
         found, valid = assemble(dataset, layer_name, level)
         height, width = expected.shape[:2]

@@ -22,6 +22,7 @@ from tests.reference.terrain import photo
 from tiler.build import build_layer
 from tiler.stores.dataset import open_dataset
 from tiler.stores.directory import DirectoryStore
+from tiler.verify import verify
 
 
 def test_an_existing_layer_is_replaced_only_when_told(height_tiff: Path, tmp_path: Path) -> None:
@@ -107,6 +108,24 @@ def test_blocks_are_on_the_disk_before_the_manifest(height_tiff: Path, tmp_path:
     build_layer(height_tiff, tmp_path / "out", settings())
     assert events[-3:] == ["sync", MANIFEST_NAME, "sync"]
     assert MANIFEST_NAME not in events[:-3]
+
+
+def test_an_interrupt_after_the_manifest_keeps_what_it_names(height_tiff: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """2026-11-22: Ctrl-C between the manifest and the end of the build deleted the blocks that had just been published."""
+    out = tmp_path / "out"
+    build_layer(height_tiff, out, settings())
+    sync = DirectoryStore.sync
+
+    def interrupted(self: DirectoryStore) -> None:
+        sync(self)
+        if b"height.2" in (out / MANIFEST_NAME).read_bytes():
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(DirectoryStore, "sync", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        build_layer(height_tiff, out, settings(overwrite=True))
+    assert sorted(path.name for path in out.iterdir()) == ["height.2", MANIFEST_NAME]
+    assert verify(open_dataset(out)).findings == []
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])

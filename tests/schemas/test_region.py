@@ -92,3 +92,10 @@ def test_blocks_in_a_rectangle(rect: Rect, block: int) -> None:
 def test_impossible_clip_regions_are_refused(arguments: Any) -> None:
     with pytest.raises(UsageError, match="the side must be positive"):
         ClipRegion(*arguments)
+
+
+@given(st.integers(-60, 60), st.integers(-60, 60), st.integers(1, 40), st.integers(1, 40), st.integers(0, 5))
+def test_coarsened_covers_the_same_ground(x: int, y: int, width: int, height: int, levels: int) -> None:
+    rect = Rect(x, y, x + width, y + height).coarsened(levels)
+    columns, rows = ({place // 2**levels for place in range(start, start + size)} for start, size in ((x, width), (y, height)))
+    assert (rect.x0, rect.x1 - 1, rect.y0, rect.y1 - 1) == (min(columns), max(columns), min(rows), max(rows))
