@@ -17,6 +17,8 @@ COMMANDS: Final = {
     "inspect": "Show a dataset, a level, a block or the values at a place.",
     "verify": "Check a dataset: files, digests, samples, seams.",
     "diff": "Compare two datasets: fields, blocks, samples.",
+    "export": "Write a layer as pmtiles, cog, dzi or exr.",
+    "copy": "Copy a dataset to another folder or store, or into archives.",
     "serve": "Serve datasets over HTTP.",
     "view": "Render a dataset, in a window or headless.",
     "accuracy": "Measure what accuracy costs in time, on a source or a built-in terrain.",
@@ -91,6 +93,9 @@ def _ended(error: BaseException) -> int:
         case _:
             click.echo("clipmap: interrupted", err=True)
             code = INTERRUPTED
+    # What is kept, and how to go on. Of an interrupt, click raises another error in its place.
+    for note in getattr(error, "__notes__", None) or getattr(error.__context__, "__notes__", ()):
+        click.echo(f"note: {note}", err=True)
     return code
 
 

@@ -54,6 +54,11 @@ class BlockIndex:
             raise InputError(f"{where}: has {len(data)} bytes instead of {count * RECORD_BYTES} ({count} blocks); rebuild the layer")
         self._data = data
 
+    @property
+    def data(self) -> bytes:
+        """The bytes of the index file."""
+        return self._data
+
     def __len__(self) -> int:
         return len(self._data) // RECORD_BYTES
 

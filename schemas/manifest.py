@@ -8,6 +8,7 @@ import base64
 import hashlib
 import json
 import zlib
+from functools import cached_property
 from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -22,6 +23,7 @@ INDEX_NAME = "index.bin"
 MAX_LEVEL_BLOCKS = 1 << 31
 """So that a few bytes of a hostile manifest cannot make a reader allocate without bound."""
 
+PATH_PATTERN = r"^[a-z][a-z0-9_.]*$"
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
 Transform = tuple[float, float, float, float, float, float]
 SampleType = Literal["uint8", "uint16", "float32"]
@@ -109,38 +111,27 @@ class Level(Model):
 
     def stored_bitmap(self) -> bytes:
         """Return the bitmap of stored blocks, row order, lowest bit first; raises InputError if the field is damaged."""
-        count = self.columns * self.rows
-        size = -(-count // 8)
-        if self.availability == "all":
-            return b"\xff" * (count // 8) + bytes([(1 << count % 8) - 1] * (size - count // 8))
-        try:
-            packed = base64.b64decode(self.availability, validate=True)
-            stream = zlib.decompressobj()
-            bitmap = stream.decompress(packed, size + 1)
-        except (ValueError, zlib.error) as error:
-            raise InputError(f"manifest: the availability of level {self.level} is damaged ({error}); rebuild the layer") from error
-        if len(bitmap) == size and (not stream.eof or stream.unused_data or int.from_bytes(bitmap, "little") >> count):
-            raise InputError(f"manifest: the availability of level {self.level} is cut off or has bits too many; rebuild the layer")
-        if len(bitmap) != size:
-            raise InputError(
-                f"manifest: the availability of level {self.level} has {len(bitmap)} bytes instead of {size}; rebuild the layer"
-            )
-        return bitmap
+        return unpack_bitmap(self.availability, self.columns * self.rows, f"the availability of level {self.level}")
 
 
-def pack_availability(bitmap: bytes, count: int) -> str:
-    """Return the ``availability`` field for a bitmap of ``count`` blocks; the inverse of ``Level.stored_bitmap``."""
-    if int.from_bytes(bitmap, "little") == (1 << count) - 1:
-        return "all"
-    return base64.b64encode(zlib.compress(bitmap, 9)).decode("ascii")
+class Patch(Model):
+    """Blocks that an update wrote anew. They have a path of their own, so that no reader of the version before is given them."""
+
+    path: str = Field(pattern=PATH_PATTERN, description="Prefix of these blocks in the store")
+    levels: list[str] = Field(
+        description="Per level, the finest first, the bitmap of the blocks that lie under this path, in the form of 'availability'"
+    )
 
 
 class Layer(Model):
     """One kind of sample on one lattice, as a pyramid of blocks."""
 
     kind: LayerKind = Field(description="What a sample is")
-    path: str = Field(
-        pattern=r"^[a-z][a-z0-9_.]*$", description="Prefix of the layer's blocks in the store; changes when a layer is rebuilt"
+    path: str = Field(pattern=PATH_PATTERN, description="Prefix of the layer's blocks in the store; changes when a layer is rebuilt")
+    patches: list[Patch] = Field(
+        default=[],
+        description="What updates wrote since: a block lies under the path of the last patch that has it, else under the layer's path; "
+        "the indexes lie under that of the last patch",
     )
     registration: Registration = Field(description="'area': samples are cell centres. 'point': samples are grid vertices")
     width: int = Field(gt=0, description="Columns of level 0 [samples]")
@@ -180,13 +171,37 @@ class Layer(Model):
         """The layer's lattice."""
         return Lattice(self.width, self.height, self.block, self.registration, self.pad)
 
+    @property
+    def paths(self) -> list[str]:
+        """The prefixes under which the layer's blocks lie, the oldest first."""
+        return [self.path, *(patch.path for patch in self.patches)]
+
+    def block_path(self, address: BlockAddress) -> str:
+        """Return the prefix under which a block lies; raises InputError if a patch's bitmap is damaged."""
+        if self.patches:
+            number = self.lattice.block_number(address)
+            for patch, bitmaps in zip(reversed(self.patches), reversed(self._patched), strict=True):
+                if bitmaps[address.level][number // 8] >> number % 8 & 1:
+                    return patch.path
+        return self.path
+
+    @cached_property
+    def _patched(self) -> list[list[bytes]]:
+        return [
+            [
+                unpack_bitmap(text, level.columns * level.rows, f"patch {patch.path!r}")
+                for text, level in zip(patch.levels, self.levels, strict=True)
+            ]
+            for patch in self.patches
+        ]
+
     def block_key(self, name: str, address: BlockAddress) -> str:
         """Return the store key of a block of this layer, which is called ``name`` in the manifest."""
-        return block_key(self.path, name, address, len(self.levels), self.suffix)
+        return block_key(self.block_path(address), name, address, len(self.levels), self.suffix)
 
     def index_key(self, level: int) -> str:
         """Return the store key of the block index of ``level``."""
-        return index_key(self.path, level)
+        return index_key(self.paths[-1], level)
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
@@ -208,7 +223,37 @@ class Layer(Model):
             raise ValueError(f"levels do not fit a lattice of {self.width} x {self.height} samples in blocks of {self.block}")
         if [level.level for level in self.levels] != list(range(lattice.levels)):
             raise ValueError("levels must be listed from 0, without gaps")
+        if any(len(patch.levels) != lattice.levels for patch in self.patches):
+            raise ValueError("a patch must have a bitmap per level")
         return self
+
+
+def unpack_bitmap(text: str, count: int, what: str) -> bytes:
+    """Return the bitmap of ``count`` blocks, row order, lowest bit first, that an ``availability`` field means.
+
+    Raises InputError that begins with ``manifest:`` and ``what`` if it is damaged.
+    """
+    size = -(-count // 8)
+    if text == "all":
+        return b"\xff" * (count // 8) + bytes([(1 << count % 8) - 1] * (size - count // 8))
+    try:
+        packed = base64.b64decode(text, validate=True)
+        stream = zlib.decompressobj()
+        bitmap = stream.decompress(packed, size + 1)
+    except (ValueError, zlib.error) as error:
+        raise InputError(f"manifest: {what} is damaged ({error}); rebuild the layer") from error
+    if len(bitmap) == size and (not stream.eof or stream.unused_data or int.from_bytes(bitmap, "little") >> count):
+        raise InputError(f"manifest: {what} is cut off or has bits too many; rebuild the layer")
+    if len(bitmap) != size:
+        raise InputError(f"manifest: {what} has {len(bitmap)} bytes instead of {size}; rebuild the layer")
+    return bitmap
+
+
+def pack_bitmap(bitmap: bytes, count: int) -> str:
+    """Return the ``availability`` field for a bitmap of ``count`` blocks; the inverse of ``unpack_bitmap``."""
+    if int.from_bytes(bitmap, "little") == (1 << count) - 1:
+        return "all"
+    return base64.b64encode(zlib.compress(bitmap, 9)).decode("ascii")
 
 
 def block_key(path: str, name: str, address: BlockAddress, levels: int, suffix: str) -> str:
@@ -250,7 +295,8 @@ class Manifest(Model):
         for name in self.layers:
             if not LAYER_NAME.fullmatch(name):
                 raise ValueError(f"layer name {name!r}: use lower-case letters, digits and underscores, a letter first")
-        if len({layer.path for layer in self.layers.values()}) < len(self.layers):
+        paths = [path for layer in self.layers.values() for path in layer.paths]
+        if len(set(paths)) < len(paths):
             raise ValueError("two layers have the same path")
         if self.version != _version(self.world, self.layers):
             raise ValueError("version does not match the content; the file was edited or damaged")
@@ -276,6 +322,11 @@ def _version(world: World, layers: dict[str, Layer]) -> str:
 def digest(data: bytes | bytearray) -> str:
     """Return the BLAKE2b-128 digest of ``data`` as 32 hexadecimal digits: the digest used for blocks, indexes and versions."""
     return hashlib.blake2b(data, digest_size=16).hexdigest()
+
+
+def new_digest() -> "hashlib.blake2b":
+    """Return what computes ``digest`` of bytes that come in parts: feed it with ``update``, ask for ``hexdigest``."""
+    return hashlib.blake2b(digest_size=16)
 
 
 def parse_manifest(data: bytes, where: str) -> Manifest:

@@ -39,7 +39,10 @@ class BuildSettings(Settings):
     max_samples: int = Field(
         default=MAX_SAMPLES, ge=1, description="A source that declares more samples, over all channels, is refused before it is read"
     )
-    task: int = Field(default=2048, ge=2, description="Side of a task [level-0 samples]; has no effect on the result")
+    mosaic: bool = Field(default=False, description="Put several georeferenced sources on one lattice, later ones on top")
+    task: int | None = Field(
+        default=None, ge=2, description="Side of a task [level-0 samples]; chosen by the size of the source; has no effect on the result"
+    )
     workers: int | None = Field(
         default=None, ge=1, le=256, description="Threads; default: the processors there are; has no effect on the result"
     )
@@ -53,7 +56,10 @@ class BuildSettings(Settings):
     spacing: float | None = Field(
         default=None, ge=1e-6, le=1e7, description="Distance between samples of a source without georeference [m]"
     )
-    overwrite: bool = Field(default=False, description="Replace the layer if the dataset has it already")
+    overwrite: bool = Field(default=False, description="Replace the layer if the dataset has it already, or was left unfinished otherwise")
+    update: bool = Field(default=False, description="Rebuild only what a changed source changes")
+    records: bool = Field(default=True, description="Keep what update and repair need: records of tasks and samples between tiers")
+    break_lock: bool = Field(default=False, description="Take over the lock of a build that has given no sign of life for minutes")
 
     @field_validator("bands")
     @classmethod

@@ -1,115 +1,105 @@
-"""Building a layer: source, plan, tasks, manifest. The manifest is written last and in one step."""
+"""Building a layer: source, plan, tasks, manifest. The manifest is written last and in one step.
 
+Whatever a task has finished is kept until the layer is published, however a build ends: the same command goes on from there.
+"""
+
+import os
 import resource
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
-from typing import Final
+from typing import Literal
 
-import numpy as np
-
-from schemas.errors import StorageError, UsageError
-from schemas.manifest import MANIFEST_NAME, Filter, Layer, Manifest, index_key
-from schemas.manifest import Source as SourceEntry
-from schemas.region import Rect
+from schemas.errors import ClipmapError, UsageError
+from schemas.manifest import Layer, Manifest
 from schemas.settings import BuildSettings
-from tiler.cascade import Cascade, Coverage, Values, held_windows
-from tiler.cut import Cutter, StageTimes, Target
-from tiler.engine import run_tasks
-from tiler.enhance import EnhancedSource, parse_enhancement
-from tiler.fill import FilledSource
+from tiler.cut import StageTimes, Target
+from tiler.destination import ChangedBlocks, Destination, NewBlocks
+from tiler.engine import Engine, LocalEngine
+from tiler.intent import can_be_continued, decide, find_ranges_known, layer_of
 from tiler.ledger import Ledger
+from tiler.pieces import PieceRef
 from tiler.plan import Plan, plan_layer
-from tiler.rowfile import RowFile
-from tiler.sources.convert import SampleSource, Source, choose_conversion
-from tiler.sources.disguise import refuse_disguised_heights
-from tiler.sources.files import open_file
-from tiler.stores.dataset import read_manifest
-from tiler.stores.directory import BuildClaim, DirectoryStore
-from tiler.stretch import Stretch, StretchedSource, find_ranges, parse_stretch
-from tiler.tasks import Task, plan_tasks
-from tiler.transfer import LinearLight
+from tiler.publish import Published, find_superseded, publish_layer, publish_update
+from tiler.records import PlanRecord, RecordBook
+from tiler.samples import open_samples
+from tiler.sources.convert import SampleSource
+from tiler.stamps import SourceStamps
+from tiler.stores import Claim, Store
+from tiler.stores.dataset import Dataset, read_manifest
+from tiler.stores.locate import open_store
+from tiler.stretch import Ranges, parse_stretch
+from tiler.tasks import Task, Tier
+from tiler.worker import Done, TaskWorker, Work
 
 Progress = Callable[[int, int], None]
 """Called with (blocks finished, blocks in all), from any thread, one call at a time."""
-
-_PORTION_ROWS: Final = 256
-_PORTION_BYTES: Final = 8 << 20
-_MAX_PORTION_ROWS: Final = 1024
-_PUSHED_ROWS: Final = 64
-"""Rows filtered at once: few enough for their levels to stay in the second-level cache, and for little memory."""
+Outcome = Literal["built", "continued", "updated", "up to date"]
 
 
 @dataclass(frozen=True, slots=True)
 class BuildReport:
-    """What a build did: the new manifest, the layer's name, remarks for the user, and what it cost."""
+    """What a build did: the manifest, the layer's name, remarks for the user, and what it cost.
+
+    ``tasks_kept`` of ``tasks`` were found finished; ``blocks_written`` is how many blocks' bytes were stored.
+    """
 
     manifest: Manifest
     layer: str
+    outcome: Outcome
     remarks: tuple[str, ...]
     times: StageTimes
     wall_s: float
     megasamples: float
     peak_rss_bytes: int
+    tasks: int
+    tasks_kept: int
+    blocks_written: int
 
 
-def build_layer(path: Path, output: Path, settings: BuildSettings, on_progress: Progress = lambda done, total: None) -> BuildReport:
-    """Build one layer of the dataset in the directory ``output`` from the file ``path``, and publish it.
+def build_layer(
+    sources: Path | Sequence[Path],
+    output: str | Path,
+    settings: BuildSettings,
+    on_progress: Progress = lambda done, total: None,
+    engine: Engine | None = None,
+) -> BuildReport:
+    """Build one layer of the dataset at ``output``, a folder or a URL, from the file (or, as a mosaic, files) ``sources``, and publish it.
 
-    The dataset is made if it does not exist. Until the manifest is replaced, readers see the old dataset, or none. Raises
-    UsageError, InputError or StorageError; then, and when interrupted, nothing of the unfinished layer is kept.
+    The dataset is made if it does not exist; a build that did not end is continued. Until the manifest is replaced, readers see
+    the old dataset, or none. Raises UsageError, InputError or StorageError; then, and when interrupted, finished tasks are kept.
     """
     started = perf_counter()
-    stretch = None if settings.stretch is None else parse_stretch(settings.stretch)
-    store = DirectoryStore(output)
-    _refuse_inside(path, output)
-    with store.exclusive() as claim:
-        _delete_unpublished(store, claim.abandoned)
+    sources = [sources] if isinstance(sources, Path) else list(sources)
+    if settings.stretch is not None:
+        parse_stretch(settings.stretch)
+    store = open_store(output)
+    for path in sources:
+        refuse_inside(path, store)
+    with store.exclusive(settings.break_lock) as claim:
         dataset = read_manifest(store)
         if dataset is None:
-            _refuse_foreign(output)
-        reader = open_file(path, output, settings.max_samples)
+            refuse_foreign(store, claim)
+        workers = settings.workers or _processors()
+
+        def known_ranges(source: SampleSource) -> Ranges | None:
+            return find_ranges_known(store, claim, dataset, source, settings)
+
+        samples = open_samples(sources, store.scratch, settings, workers, known_ranges)
         try:
-            source = Source(reader, choose_conversion(reader.info, settings))
-            plan = plan_layer(source, dataset, settings)
-            if settings.decode is None:
-                refuse_disguised_heights(reader, source.conversion)
-            plan = replace(plan, source=_prepared(source, settings, stretch, plan.workers))
-            manifest, times = _build(plan, store, claim, dataset, on_progress)
+            plan = plan_layer(samples, dataset, settings)
+            build = _Build(plan, store, claim, dataset, SourceStamps(samples.info), settings, engine or LocalEngine(plan.workers))
+            build.run(on_progress)
         finally:
-            reader.close()
-    return BuildReport(
-        manifest=manifest,
-        layer=plan.name,
-        remarks=_remarks(plan, manifest.layers[plan.name]),
-        times=times,
-        wall_s=perf_counter() - started,
-        megasamples=plan.lattice.width * plan.lattice.height / 1e6,
-        peak_rss_bytes=_peak_rss_bytes(),
-    )
+            samples.close()
+    return build.report(perf_counter() - started)
 
 
-def _prepared(source: SampleSource, settings: BuildSettings, stretch: Stretch | None, workers: int) -> SampleSource:
-    """Wrap the source in what changes its samples before the pyramid is built; raises UsageError for the wrong kind of layer.
-
-    A stretch by a cut reads the whole file, and raises InputError if there is nothing to stretch.
-    """
-    if stretch is not None:
-        source = StretchedSource(source, find_ranges(source, stretch, workers))
-    if settings.fill:
-        if source.conversion.kind != "height":
-            raise UsageError("--fill is for heights; voids of imagery stay transparent")
-        source = FilledSource(source, settings.fill)
-    if settings.enhance is not None:
-        source = EnhancedSource(source, parse_enhancement(settings.enhance))
-    if settings.linear_light:
-        if source.conversion.kind != "imagery":
-            raise UsageError("--linear-light is for imagery; heights are linear already")
-        source = LinearLight(source)
-    return source
+def _processors() -> int:
+    return len(os.sched_getaffinity(0))
 
 
 def _peak_rss_bytes() -> int:
@@ -121,221 +111,203 @@ def _peak_rss_bytes() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
-def _refuse_inside(path: Path, output: Path) -> None:
+def refuse_inside(path: Path, store: Store) -> None:
     """Refuse a source that lies in the dataset: a rebuild deletes the folder of the layer it replaces."""
-    if path.resolve().is_relative_to(output.resolve()) and path.exists():
-        raise UsageError(f"{path}: lies inside {output}, where the dataset is to be; move one of them")
+    folder = Path(store.location)
+    if path.exists() and path.resolve().is_relative_to(folder.resolve()):
+        raise UsageError(f"{path}: lies inside {folder}, where the dataset is to be; move one of them")
 
 
-def _refuse_foreign(output: Path) -> None:
-    """Refuse a folder that holds something else than a dataset."""
-    if foreign := sorted(entry.name for entry in output.iterdir() if not entry.name.startswith(".")):
-        raise UsageError(f"{output}: not a dataset, and not empty (it holds {foreign[0]}); choose another folder for -o")
+def refuse_foreign(store: Store, claim: Claim) -> None:
+    """Refuse a place that holds something else than a dataset or an unfinished one."""
+    foreign = sorted({key.partition("/")[0] for key in store.keys("")} - set(claim.abandoned))
+    if foreign:
+        raise UsageError(f"{store.location}: not a dataset, and not empty (it holds {foreign[0]}); choose another folder for -o")
 
 
-def _delete_unpublished(store: DirectoryStore, prefixes: Sequence[str]) -> None:
-    """Delete of the announced ``prefixes`` what the manifest does not name: never finished, or replaced."""
-    dataset = read_manifest(store)
-    published = set() if dataset is None else {layer.path for layer in dataset.layers.values()}
-    for prefix in prefixes:
-        if prefix not in published:
-            store.delete_prefix(prefix)
+class _Build:
+    """One build under its claim."""
 
+    def __init__(
+        self,
+        plan: Plan,
+        store: Store,
+        claim: Claim,
+        dataset: Manifest | None,
+        stamps: SourceStamps,
+        settings: BuildSettings,
+        engine: Engine,
+    ) -> None:
+        self._store, self._claim, self._dataset = store, claim, dataset
+        self._stamps, self._settings, self._engine = stamps, settings, engine
+        self._layer = None if dataset is None else dataset.layers.get(plan.name)
+        self._sweep(plan.name)
+        self._intent = decide(store, claim, dataset, plan, stamps, settings)
+        record = self._intent.record
+        # The records of another partition would be of no use, and blocks do not depend on it.
+        self.plan = plan if record is None else replace(plan, partition=record.partition)
+        self._book = RecordBook(store, self._intent.tasks_path)
+        self._times = StageTimes()
+        self._kept = self._written = 0
+        self._changed = False
+        self.manifest = dataset
 
-def _build(
-    plan: Plan, store: DirectoryStore, claim: BuildClaim, dataset: Manifest | None, on_progress: Progress
-) -> tuple[Manifest, StageTimes]:
-    output = Path(store.location)
-    replaced = dataset.layers[plan.name].path if dataset is not None and plan.name in dataset.layers else None
-    path = _unused_path(plan.name, replaced, output)
-    announced = [path] if replaced is None else [path, replaced]
-    claim.announce(*announced)
-    target = Target(store, path, plan.name, plan.lattice, plan.block, plan.codec, plan.linear_light)
-    ledger = Ledger(plan.lattice, plan.source.conversion.channels, on_progress)
-    try:
-        times = _run_tiers(plan, target, ledger, output)
-        manifest = _publish(plan, target, ledger, dataset)
-    except BaseException:
-        with suppress(StorageError):
-            _delete_unpublished(store, announced)
-        raise
-    _delete_unpublished(store, announced)
-    return manifest, times
+    def _sweep(self, name: str) -> None:
+        """Delete what an update that was published, and then killed, did not come to delete."""
+        if self._layer is not None and set(self._claim.abandoned) & {patch.path for patch in self._layer.patches}:
+            self._store.delete(find_superseded(self._store, name, self._layer))
 
+    def run(self, on_progress: Progress) -> None:
+        """Do what is to be done, and delete what is superseded."""
+        intent = self._intent
+        foreign = [path for path in self._claim.abandoned if layer_of(path) != self.plan.name]
+        others = [path for path in foreign if can_be_continued(self._store, self._dataset, path)]
+        obsolete = [path for path in self._claim.abandoned if path not in others and path != intent.path]
+        if intent.act != "nothing":
+            replaced = self._layer.paths if self._layer is not None and intent.act == "build" else []
+            self._claim.announce(*others, *obsolete, *replaced, intent.path)
+            with self._kept_on_failure(others):
+                published = self._build(on_progress)
+            self.manifest, self._changed = published.manifest, published.changed
+            self._store.delete(published.superseded_keys)
+            obsolete += published.superseded_paths
+        self._delete(obsolete)
+        self._claim.announce(*others)
 
-def _unused_path(name: str, replaced: str | None, output: Path) -> str:
-    """Return a prefix that no version so far had and that nothing lies under.
+    def _delete(self, paths: Sequence[str]) -> None:
+        """Delete of ``paths`` those that no manifest names; an update that changed nothing leaves an empty one."""
+        named = set() if self.manifest is None else {path for layer in self.manifest.layers.values() for path in layer.paths}
+        for path in {*paths, self._intent.path} - named:
+            self._store.delete_prefix(path)
+        if not self._settings.records and self._intent.act != "nothing":
+            self._book.delete()
 
-    A reader of an old manifest then finds old blocks or none, never new ones, and nobody's files are in the way.
-    """
-    count = 1 if replaced is None else int(replaced.partition(".")[2] or 1) + 1
-    while (output / (path := name if count == 1 else f"{name}.{count}")).exists():
-        count += 1
-    return path
-
-
-class _Carried:
-    """The float32 samples of a level that lies between two tiers, with their coverage as one more channel."""
-
-    def __init__(self, size: tuple[int, int], channels: int, masked: bool, scratch: Path) -> None:
-        self._masked = masked
-        self._channels = channels
-        self._rows = RowFile(*size, channels + masked, np.dtype(np.float32), scratch)
-        self.close = self._rows.close
-
-    def write(self, x: int, y: int, values: Values, coverage: Coverage | None) -> None:
-        """Keep samples with their top-left one at (x, y)."""
-        self._rows.write(x, y, values if coverage is None else np.concatenate([values, coverage[..., np.newaxis]], axis=-1))
-
-    def read(self, window: Rect) -> tuple[Values, Coverage | None]:
-        """Return values (rows, columns, channels) and coverage of a window."""
-        rows = self._rows.read(window)
-        if not self._masked:
-            return rows, None
-        return np.ascontiguousarray(rows[..., : self._channels]), np.ascontiguousarray(rows[..., self._channels])
-
-
-Samples = SampleSource | _Carried
-
-
-def _run_tiers(plan: Plan, target: Target, ledger: Ledger, scratch: Path) -> StageTimes:
-    times = StageTimes()
-    samples: Samples = plan.source
-    for tier in plan.tiers:
-        carried = None
-        if tier.carry:
-            size = plan.lattice.level_size(tier.first + tier.count)
-            carried = _Carried(size, plan.source.conversion.channels, plan.recipe.masked, scratch)
+    @contextmanager
+    def _kept_on_failure(self, others: Sequence[str]) -> Iterator[None]:
+        """Say how much is kept when a build does not end; if no task was finished there is nothing to keep."""
         try:
-            work = _TaskRunner(plan, target, ledger, samples, carried)
-            for part in run_tasks(work, plan_tasks(plan.lattice, tier, plan.source.info.layout), plan.workers):
-                times.add(part)
-        finally:
-            if isinstance(samples, _Carried):
-                samples.close()
-        if carried is not None:
-            samples = carried
-    return times
+            yield
+        except BaseException as error:
+            with suppress(ClipmapError):
+                finished = self._book.finished()
+                if finished > 0:
+                    error.add_note(f"{finished} of {self.plan.task_count} tasks are finished and kept: the same command goes on from there")
+                elif self._intent.act == "build" and self._intent.record is None:
+                    self._store.delete_prefix(self._intent.path)
+                    self._claim.announce(*others)
+            raise
+
+    def _build(self, on_progress: Progress) -> Published:
+        plan, intent = self.plan, self._intent
+        record = self._plan_record()
+        RecordBook(self._store, intent.path).write_plan(record)
+        ledger = Ledger(plan.lattice, plan.source.conversion.channels)
+        counter = _Counter(plan, on_progress)
+        published = None if self._dataset is None else Dataset(self._store, self._dataset)
+        worker = TaskWorker(plan, self._target(published), self._book, self._stamps, counter.add)
+        pieces: dict[Task, str] = {}
+        for tier in plan.tiers:
+            handed_on: dict[Task, str] = {}
+            for done in self._engine.run(worker, self._works(worker, tier, pieces)):
+                self._note(done, ledger)
+                if done.record.piece is not None:
+                    handed_on[done.task] = done.record.piece
+            pieces = handed_on
+        self._stamps.require_unchanged()
+        self._claim.confirm()
+        if intent.act == "update" and published is not None:
+            result = publish_update(plan, self._store, intent.path, ledger, published)
+            self._book.write_plan(record)
+            RecordBook(self._store, intent.path).delete()
+            return result
+        return publish_layer(plan, self._store, intent.path, ledger, self._dataset)
+
+    def _works(self, worker: TaskWorker, tier: Tier, pieces: dict[Task, str]) -> Iterator[Work]:
+        for task in self.plan.tasks(tier):
+            yield Work(task, tuple(PieceRef(below, pieces[below]) for below in worker.below(task)))
+
+    def _note(self, done: Done, ledger: Ledger) -> None:
+        ledger.enter(done.task, done.record)
+        self._times.add(done.times)
+        self._kept += done.kept
+        self._written += done.written
+
+    def _target(self, published: Dataset | None) -> Target:
+        plan, path = self.plan, self._intent.path
+        destination: Destination
+        if self._intent.act == "update" and published is not None:
+            destination = ChangedBlocks(self._store, path, published, plan.name)
+        else:
+            destination = NewBlocks(self._store, path, plan.name, plan.lattice.levels, plan.codec.suffix)
+        return Target(self._store, destination, plan.lattice, plan.block, plan.codec, plan.linear_light)
+
+    def _plan_record(self) -> PlanRecord:
+        return PlanRecord(
+            signature=self.plan.signature,
+            place=self.plan.place,
+            partition=self.plan.partition,
+            sources=self._stamps.paths,
+            stamps=self._stamps.stamps,
+            ranges=list(self.plan.source.conversion.stretch or ()),
+            settings=self._settings.model_copy(update={"overwrite": False, "update": False, "break_lock": False}),
+        )
+
+    def report(self, wall_s: float) -> BuildReport:
+        """Return what was done."""
+        plan, manifest = self.plan, self.manifest
+        if manifest is None:
+            raise UsageError("nothing was built")
+        return BuildReport(
+            manifest=manifest,
+            layer=plan.name,
+            outcome=self._outcome(),
+            remarks=_remarks(plan, manifest.layers[plan.name]) + self._continued(),
+            times=self._times,
+            wall_s=wall_s,
+            megasamples=plan.lattice.width * plan.lattice.height / 1e6,
+            peak_rss_bytes=_peak_rss_bytes(),
+            tasks=plan.task_count,
+            tasks_kept=self._kept if self._intent.act != "nothing" else plan.task_count,
+            blocks_written=self._written,
+        )
+
+    def _outcome(self) -> Outcome:
+        if self._intent.act == "update":
+            return "updated" if self._changed else "up to date"
+        if self._intent.act == "nothing":
+            return "up to date"
+        return "built" if self._intent.record is None else "continued"
+
+    def _continued(self) -> tuple[str, ...]:
+        if self._intent.act == "nothing" or self._claim.predecessor is None or not self._kept:
+            return ()
+        return (f"went on with what {self._claim.predecessor} had left: {self._kept} of {self.plan.task_count} tasks were finished",)
 
 
-class _TaskRunner:
-    """Runs one task: reads its window in portions, filters, cuts and stores its blocks, keeps its piece for the next tier."""
+class _Counter:
+    """Counts finished blocks from any thread."""
 
-    def __init__(self, plan: Plan, target: Target, ledger: Ledger, samples: Samples, carried: _Carried | None) -> None:
-        self._plan, self._target, self._ledger = plan, target, ledger
-        self._samples, self._carried = samples, carried
+    def __init__(self, plan: Plan, on_progress: Progress) -> None:
+        counts = (plan.lattice.block_counts(level) for level in range(plan.lattice.levels))
+        self._total, self._done = sum(columns * rows for columns, rows in counts), 0
+        self._on_progress = on_progress
+        self._lock = threading.Lock()
 
-    def __call__(self, task: Task) -> StageTimes:
-        """Run ``task``; returns the seconds it took by stage."""
-        plan, tier = self._plan, task.tier
-        size = plan.lattice.level_size(tier.first)
-        pads = [plan.lattice.pad] * tier.count + [0] * tier.carry
-        windows = held_windows(size, task.core, pads, plan.recipe.kernel.reach)
-        cutter = Cutter(self._target, tier.first, task.core, self._ledger.note)
-
-        def sink(step: int, first: int, values: Values, coverage: Coverage | None) -> None:
-            if step < tier.count:
-                cutter.take(tier.first + step, first, values, coverage, windows[step].x0)
-            elif self._carried is not None:
-                self._carried.write(windows[step].x0, first, values, coverage)
-
-        cascade = Cascade(size, windows, plan.source.conversion.channels, plan.recipe, sink)
-        whole, times = windows[0], cutter.times
-        portion_rows = self._portion_rows(whole.width)
-        started = perf_counter()
-        y = whole.y0
-        while y < whole.y1:
-            end = min(whole.y1, (y // portion_rows + 1) * portion_rows)
-            before_read = perf_counter()
-            values, coverage = self._samples.read(Rect(whole.x0, y, whole.x1, end))
-            times.read_s += perf_counter() - before_read
-            for row in range(0, end - y, _PUSHED_ROWS):
-                rows = slice(row, row + _PUSHED_ROWS)
-                cascade.push(values[rows], None if coverage is None else coverage[rows])
-            y = end
-        times.filter_s = perf_counter() - started - times.read_s - times.encode_s - times.write_s
-        return times
-
-    def _portion_rows(self, width: int) -> int:
-        """Return how many rows are read at once: whole tiles, or each would be decoded twice, but no more memory than needed."""
-        chunk = self._plan.source.info.chunk_rows
-        affordable = _PORTION_BYTES // (width * self._plan.source.conversion.channels * 4)
-        return min(max(1, min(affordable, _PORTION_ROWS) // chunk) * chunk, _MAX_PORTION_ROWS)
-
-
-def _publish(plan: Plan, target: Target, ledger: Ledger, dataset: Manifest | None) -> Manifest:
-    for level in range(plan.lattice.levels):
-        target.store.write(index_key(target.path, level), ledger.index(level))
-    layers = {} if dataset is None else dict(dataset.layers)
-    layers[plan.name] = _layer_entry(plan, target, ledger)
-    manifest = Manifest.create(generator=f"clipmap {version('clipmap')}", world=plan.placement.world, layers=layers)
-    target.store.sync()
-    target.store.write(MANIFEST_NAME, manifest.to_json())
-    target.store.sync()
-    return manifest
-
-
-def _layer_entry(plan: Plan, target: Target, ledger: Ledger) -> Layer:
-    kernel = plan.recipe.kernel
-    return Layer(
-        kind=plan.block.kind,
-        path=target.path,
-        registration=plan.lattice.registration,
-        width=plan.lattice.width,
-        height=plan.lattice.height,
-        block=plan.lattice.block,
-        pad=plan.lattice.pad,
-        channels=plan.block.channels,
-        alpha=plan.block.alpha,
-        dtype=plan.block.dtype,
-        unit="metre" if plan.block.kind == "height" else None,
-        codec=plan.codec.spec,
-        suffix=plan.codec.suffix,
-        media_type=plan.codec.media_type,
-        max_error=plan.codec.max_error,
-        transform=plan.placement.transform,
-        ground_spacing_m=plan.placement.ground_spacing_m,
-        filter=Filter(
-            kernel=kernel.name,
-            radius=kernel.radius,
-            edge=plan.recipe.edge,
-            clamp="local" if plan.recipe.clamp else "none",
-            linear_light=plan.linear_light,
-        ),
-        source=_source_entry(plan),
-        fill=plan.fill,
-        enhance=plan.enhance,
-        statistics=ledger.statistics(),
-        levels=[ledger.level(level) for level in range(plan.lattice.levels)],
-    )
-
-
-def _source_entry(plan: Plan) -> SourceEntry:
-    info, conversion = plan.source.info, plan.source.conversion
-    return SourceEntry(
-        name=info.path.name,
-        format=info.format,
-        width=info.width,
-        height=info.height,
-        channels=info.channels,
-        dtype=info.dtype.name,
-        file_bytes=info.file_bytes,
-        nodata=conversion.nodata,
-        decode=conversion.decode,
-        scale=conversion.scale,
-        offset=conversion.offset,
-        stretch=None if conversion.stretch is None else list(conversion.stretch),
-        placement=plan.placement.how,
-    )
+    def add(self, count: int) -> None:
+        """Count more blocks; a piece that had to be made again counts its task's blocks twice."""
+        with self._lock:
+            self._done = min(self._done + count, self._total)
+            self._on_progress(self._done, self._total)
 
 
 def _remarks(plan: Plan, layer: Layer) -> tuple[str, ...]:
     """Return what the user should know although nothing is wrong."""
     remarks = []
+    name = plan.source.info.path.name
     if plan.placement.how == "fitted":
-        remarks.append(f"{plan.source.info.path.name} has no georeference: spread over the dataset's extent")
+        remarks.append(f"{name} has no georeference: spread over the dataset's extent")
     if plan.placement.how == "assumed":
-        remarks.append(f"{plan.source.info.path.name} has no georeference and no --spacing: samples lie one unit apart")
+        remarks.append(f"{name} has no georeference and no --spacing: samples lie one unit apart")
     if layer.statistics.valid == 0:
-        remarks.append(f"{plan.source.info.path.name} has no valid sample: every block is blank")
+        remarks.append(f"{name} has no valid sample: every block is blank")
     return tuple(remarks)

@@ -12,6 +12,7 @@ from schemas.findings import Finding, FindingKind
 from schemas.manifest import Layer, Level, digest
 from tiler.blockreader import BlockReader, DecodedBlock
 from tiler.measure import measure
+from tiler.records import TASKS
 from tiler.stores.dataset import Dataset
 
 REBUILD: Final = "rebuild the layer (clipmap build --overwrite)"
@@ -133,8 +134,8 @@ def check_files(dataset: Dataset, name: str, indexes: dict[int, BlockIndex]) -> 
     layer = dataset.manifest.layer(name)
     own = {layer.index_key(level) for level in range(len(layer.levels))}
     found = []
-    for key in dataset.store.keys(layer.path):
-        if key in own:
+    for key in (key for path in layer.paths for key in dataset.store.keys(path)):
+        if key in own or key.split("/")[1] == TASKS:
             continue
         address = _block_of(layer, name, key)
         if address is None:

@@ -11,10 +11,11 @@ from schemas.address import BlockAddress
 from schemas.blockindex import BLANK, BlockRecord
 from schemas.errors import InputError
 from schemas.lattice import Lattice
-from schemas.manifest import block_key, digest
+from schemas.manifest import digest
 from schemas.region import Rect
 from tiler.cascade import Coverage, Values
 from tiler.codecs import BlockFormat, Codec, Mask, Samples
+from tiler.destination import Destination
 from tiler.measure import measure
 from tiler.stores import Store
 from tiler.transfer import encode_srgb
@@ -53,16 +54,11 @@ class Target:
     """Where the blocks of a layer go and in what form."""
 
     store: Store
-    path: str
-    name: str
+    destination: Destination
     lattice: Lattice
     block: BlockFormat
     codec: Codec
     linear_light: bool = False
-
-    def key(self, address: BlockAddress) -> str:
-        """Return the store key of a block."""
-        return block_key(self.path, self.name, address, self.lattice.levels, self.codec.suffix)
 
 
 def round_samples(values: Values, coverage: Coverage | None, block: BlockFormat, linear_light: bool = False) -> tuple[Samples, Mask | None]:
@@ -121,11 +117,12 @@ class Cutter:
     """Takes the rows a cascade emits for one task and stores the blocks of its levels.
 
     ``core`` are the task's samples of level ``first_level``; rows and columns beyond it and its pad (the halo) are dropped.
-    ``on_block`` is called once per finished block.
+    ``on_block`` is called once per finished block; ``written`` counts those whose bytes were stored.
     """
 
     def __init__(self, target: Target, first_level: int, core: Rect, on_block: Callable[[CutBlock], None]) -> None:
         self.times = StageTimes()
+        self.written = 0
         self._target = target
         self._first_level = first_level
         self._core = core
@@ -179,10 +176,14 @@ class Cutter:
         whole = target.lattice.core(address).grown(target.lattice.pad)
         data = target.codec.encode(*_completed(samples, mask, seen, whole, target.block))
         encoded = perf_counter()
-        target.store.write(target.key(address), data)
+        record = BlockRecord(digest(data), len(data), count, low, high)
+        key = target.destination.key(address, record)
+        if key is not None:
+            target.store.write(key, data)
+            self.written += 1
         self.times.encode_s += encoded - started
         self.times.write_s += perf_counter() - encoded
-        return CutBlock(address, BlockRecord(digest(data), len(data), count, low, high), _floats(minima), _floats(maxima), _floats(sums))
+        return CutBlock(address, record, _floats(minima), _floats(maxima), _floats(sums))
 
     def _check_range(self, address: BlockAddress, low: float, high: float) -> None:
         """Refuse source values the codec cannot hold; a value beside the end of the range by rounding is none of them."""

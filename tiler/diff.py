@@ -153,7 +153,7 @@ def _why_not_compared(a: Layer, b: Layer) -> str | None:
 
 
 def _fields(layer: Layer) -> dict[str, JsonValue]:
-    return layer.model_dump(mode="json", exclude={"path", "levels"})
+    return layer.model_dump(mode="json", exclude={"path", "patches", "levels"})
 
 
 def _compared(a: DecodedBlock | None, b: DecodedBlock | None) -> _BlockDifference:

@@ -1,8 +1,11 @@
-"""Where tasks run: on threads of this machine. Kernels, codecs and readers release the GIL."""
+"""Where tasks run: on threads of this machine (kernels, codecs and readers release the GIL), or wherever another engine takes them."""
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from typing import TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
+
+if TYPE_CHECKING:
+    from tiler.worker import Done, TaskWorker, Work
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -31,3 +34,22 @@ def run_tasks(work: Callable[[Task], Result], tasks: Iterable[Task], workers: in
         finally:
             for future in running:
                 future.cancel()
+
+
+class Engine(Protocol):
+    """Runs the tasks of a tier; the results do not depend on the engine."""
+
+    def run(self, worker: "TaskWorker", works: Iterable["Work"]) -> Iterator["Done"]:
+        """Yield what became of every task, as they end; raises the first error."""
+        ...
+
+
+class LocalEngine:
+    """Runs tasks on ``workers`` threads of this process."""
+
+    def __init__(self, workers: int) -> None:
+        self._workers = workers
+
+    def run(self, worker: "TaskWorker", works: Iterable["Work"]) -> Iterator["Done"]:
+        """Yield what became of every task, as they end; raises the first error."""
+        return run_tasks(worker, works, self._workers)

@@ -30,8 +30,7 @@ from numpy.typing import NDArray
 
 from schemas.errors import MissingExtraError, UsageError
 from schemas.region import Rect
-from tiler.sources import FileInfo
-from tiler.sources.convert import Conversion, SampleSource
+from tiler.sources.convert import DerivedSource, SampleSource
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -118,7 +117,7 @@ class _Held:
     coverage: Float32 | None
 
 
-class EnhancedSource:
+class EnhancedSource(DerivedSource):
     """A source of imagery whose samples are enhanced; the coverage is that of the file.
 
     Beyond the edge of the file it is mirrored. Smoothing is weighed by coverage, so nothing that is void takes part; near voids,
@@ -129,10 +128,7 @@ class EnhancedSource:
     def __init__(self, source: SampleSource, enhancement: Enhancement) -> None:
         if source.conversion.kind != "imagery":
             raise UsageError(f"{source.info.path}: --enhance is for imagery, enhanced heights would be false; leave it out")
-        self.info: FileInfo = source.info
-        self.conversion: Conversion = source.conversion
-        self.masked: bool = source.masked
-        self._source = source
+        super().__init__(source)
         self._gain = enhancement.gain
         self._starlet = _Starlet()
         self._top = float(np.iinfo(source.conversion.dtype).max)
@@ -154,9 +150,10 @@ class EnhancedSource:
             self._enhance(values, coverage, seen, piece)
         return enhanced, None if coverage is None else coverage[np.ix_(rows[REACH:-REACH], columns[REACH:-REACH])]
 
-    def close(self) -> None:
-        """Close the source."""
-        self._source.close()
+    def begin(self) -> None:
+        """Start anew what ``digest`` covers, for this thread, and forget the rows held."""
+        self._local.held = None
+        super().begin()
 
     def _rows(self, window: Rect) -> tuple[Float32, Float32 | None]:
         """Read a window of the file, and keep what the next window below shares with it: no tile is decoded twice."""

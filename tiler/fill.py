@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.region import Rect
-from tiler.sources import FileInfo
-from tiler.sources.convert import Conversion, SampleSource
+from tiler.sources.convert import DerivedSource, SampleSource
 
 Float32 = NDArray[np.float32]
 
@@ -60,15 +59,12 @@ def fill_voids(values: Float32, coverage: Float32, across: int, inner: tuple[int
     return count
 
 
-class FilledSource:
+class FilledSource(DerivedSource):
     """A source of heights whose voids of up to ``across`` samples are filled."""
 
     def __init__(self, source: SampleSource, across: int) -> None:
-        self._source = source
+        super().__init__(source)
         self._across = across
-        self.info: FileInfo = source.info
-        self.conversion: Conversion = source.conversion
-        self.masked: bool = source.masked
 
     def read(self, window: Rect) -> tuple[Float32, Float32 | None]:
         """Return heights (rows, columns, 1) and coverage of ``window``."""
@@ -81,7 +77,3 @@ class FilledSource:
         filled, covered = np.empty((window.height, window.width), np.float32), np.empty((window.height, window.width), np.float32)
         fill_voids(values[..., 0], coverage, self._across, inner, filled, covered)
         return filled[..., np.newaxis], covered
-
-    def close(self) -> None:
-        """Close the source."""
-        self._source.close()

@@ -1,14 +1,20 @@
 """What a build decides before the first pixel is read."""
 
+import json
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
+from importlib.metadata import version
 from typing import Final
 
 import numpy as np
+from pydantic import JsonValue
 
 from schemas.errors import UsageError
 from schemas.lattice import Lattice, Registration
-from schemas.manifest import LayerKind, Manifest
+from schemas.manifest import LayerKind, Manifest, digest
+from schemas.region import Rect
 from schemas.settings import BuildSettings
 from tiler.cascade import Recipe
 from tiler.codecs import BlockFormat, Codec, open_codec
@@ -16,8 +22,9 @@ from tiler.edges import EdgeRule
 from tiler.enhance import parse_enhancement
 from tiler.kernels import DESIGNS, FIXED_RADIUS
 from tiler.placement import Placement, place
+from tiler.records import Partition
 from tiler.sources.convert import SampleSource
-from tiler.tasks import Tier, plan_tiers
+from tiler.tasks import Task, Tier, choose_task_side, count_tasks, plan_tasks, plan_tiers
 
 _MAX_BLOCKS: Final = 1 << 27
 """The block index is held in memory: 6 GiB for all levels at this number."""
@@ -38,9 +45,9 @@ _DEFAULTS: Final[dict[LayerKind, _Defaults]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Plan:
-    """One layer to build: what is read, on which lattice, how it is filtered, encoded and placed, by how many threads."""
+    """One layer to build: what is read, on which lattice, how it is filtered, encoded and placed, in which tasks, by how many threads."""
 
     source: SampleSource
     name: str
@@ -49,22 +56,78 @@ class Plan:
     block: BlockFormat
     codec: Codec
     placement: Placement
-    tiers: tuple[Tier, ...]
+    partition: Partition
     workers: int
     linear_light: bool
     fill: int
     enhance: str | None
 
+    @cached_property
+    def tiers(self) -> tuple[Tier, ...]:
+        """The tiers of levels that the partition gives."""
+        return tuple(plan_tiers(self.lattice, self.partition.task))
+
+    @cached_property
+    def signature(self) -> dict[str, JsonValue]:
+        """Everything that a block's bytes depend on besides the source's pixels, by the names that users know."""
+        conversion, kernel, info = self.source.conversion, self.recipe.kernel, self.source.info
+        return {
+            "size": [self.lattice.width, self.lattice.height],
+            "layer": conversion.kind,
+            "source type": f"{info.channels} x {info.dtype.name}" + (f" of {info.bits} bits" if info.bits else ""),
+            "bands": [channel + 1 for channel in conversion.colours],
+            "alpha": None if conversion.alpha is None else f"channel {conversion.alpha + 1}" + " premultiplied" * conversion.premultiplied,
+            "voids": self.recipe.masked,
+            "nodata": conversion.nodata,
+            "decode": conversion.decode,
+            "scale": conversion.scale,
+            "offset": conversion.offset,
+            "stretch": None if conversion.stretch is None else [list(limits) for limits in conversion.stretch],
+            "block": self.lattice.block,
+            "pad": self.lattice.pad,
+            "codec": self.codec.spec,
+            "filter": kernel.name,
+            "radius": kernel.radius,
+            "edge": self.recipe.edge,
+            "clamp": "local" if self.recipe.clamp else "none",
+            "linear-light": self.linear_light,
+            "fill": self.fill,
+            "enhance": self.enhance,
+            "clipmap": version("clipmap"),
+            "imagecodecs": version("imagecodecs"),
+        }
+
+    @cached_property
+    def digest(self) -> str:
+        """Digest of the signature; task records with another one belong to another plan."""
+        return digest(json.dumps(self.signature, sort_keys=True).encode())
+
+    @property
+    def place(self) -> dict[str, JsonValue]:
+        """Where the layer lies."""
+        return {
+            "coordinates": self.placement.world.crs or self.placement.world.unit,
+            "transform": list(self.placement.transform),
+            "placement": self.placement.how,
+        }
+
+    def tasks(self, tier: Tier, within: Rect | None = None) -> Iterator[Task]:
+        """Yield the tasks of a tier whose cores meet the samples ``within`` of its first level, by default all."""
+        return plan_tasks(self.lattice, tier, self.partition.layout, within)
+
+    @property
+    def task_count(self) -> int:
+        """Number of tasks of all tiers."""
+        return count_tasks(self.lattice, self.tiers, self.partition.layout)
+
 
 def plan_layer(source: SampleSource, dataset: Manifest | None, settings: BuildSettings) -> Plan:
     """Return the plan for the layer that ``source`` becomes beside those of ``dataset``.
 
-    Raises UsageError if the layer is there already, its codec cannot hold it, or it does not go with the dataset.
+    Raises UsageError if its codec cannot hold it, or it does not go with the dataset.
     """
     info, conversion = source.info, source.conversion
     name = conversion.kind
-    if dataset is not None and name in dataset.layers and not settings.overwrite:
-        raise UsageError(f"the dataset has a layer {name!r} already; add --overwrite to replace it, or choose another folder")
     defaults = _DEFAULTS[conversion.kind]
     lattice = Lattice(info.width, info.height, settings.block, defaults.registration, settings.pad)
     columns, rows = lattice.block_counts(0)
@@ -80,6 +143,7 @@ def plan_layer(source: SampleSource, dataset: Manifest | None, settings: BuildSe
     )
     radius = settings.radius or (1 if settings.filter in FIXED_RADIUS else defaults.radius)
     kernel = DESIGNS[settings.filter](radius, defaults.registration)
+    workers = settings.workers or len(os.sched_getaffinity(0))
     return Plan(
         source=source,
         name=name,
@@ -88,8 +152,8 @@ def plan_layer(source: SampleSource, dataset: Manifest | None, settings: BuildSe
         block=block,
         codec=open_codec(_codec_spec(source, block, settings), block),
         placement=place(info, defaults.registration, settings.spacing, dataset, name),
-        tiers=tuple(plan_tiers(lattice, settings.task)),
-        workers=settings.workers or len(os.sched_getaffinity(0)),
+        partition=Partition(task=settings.task or choose_task_side(lattice, workers), layout=info.layout),
+        workers=workers,
         linear_light=settings.linear_light,
         fill=settings.fill,
         enhance=None if settings.enhance is None else parse_enhancement(settings.enhance).spec,

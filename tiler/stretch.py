@@ -18,7 +18,7 @@ from schemas.errors import InputError, UsageError
 from schemas.region import Rect
 from tiler.engine import run_tasks
 from tiler.sources import FileInfo
-from tiler.sources.convert import Conversion, SampleSource
+from tiler.sources.convert import DerivedSource, SampleSource
 
 Ranges = tuple[tuple[float, float], ...]
 """(min, max) of every colour channel [units of the file]."""
@@ -105,16 +105,14 @@ def _portions(info: FileInfo) -> Iterator[Rect]:
             yield Rect(x, y, min(x + columns, info.width), min(y + rows, info.height))
 
 
-class StretchedSource:
+class StretchedSource(DerivedSource):
     """A source of 16-bit imagery as samples from 0 to 255, not yet rounded; the coverage is that of the file."""
 
     def __init__(self, source: SampleSource, ranges: Ranges) -> None:
-        self._source = source
+        super().__init__(source)
         self._low, high = (np.array(limits, np.float32) for limits in zip(*ranges, strict=True))
         self._width = high - self._low
-        self.info: FileInfo = source.info
-        self.conversion: Conversion = replace(source.conversion, dtype="uint8", stretch=ranges)
-        self.masked: bool = source.masked
+        self.conversion = replace(source.conversion, dtype="uint8", stretch=ranges)
 
     def read(self, window: Rect) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """Return stretched samples (rows, columns, channels) and coverage of ``window``; raises InputError if it cannot be read."""
@@ -125,7 +123,3 @@ class StretchedSource:
         if coverage is not None:
             stretched[coverage == 0] = 0
         return stretched, coverage
-
-    def close(self) -> None:
-        """Close the source."""
-        self._source.close()

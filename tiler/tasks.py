@@ -9,6 +9,10 @@ from schemas.region import Rect
 from tiler.sources import Layout
 
 _BAND: Final = 32768
+_SIDES: Final = (4096, 2048)
+"""Sides of tasks, the better one first: of every level-0 sample 1/256 or 1/64 sample is handed on as float32."""
+_TASKS_PER_WORKER: Final = 4
+"""So few tasks for every worker, and the last of them leaves the others idle for too long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +31,25 @@ class Task:
     tier: Tier
     core: Rect
 
+    def blocks(self, side: int) -> Iterator[tuple[int, Rect]]:
+        """Yield, per level that the task makes, the rectangle of its blocks of ``side`` samples (columns and rows of blocks)."""
+        for step in range(self.tier.count):
+            core = self.core.coarsened(step)
+            yield self.tier.first + step, Rect(core.x0 // side, core.y0 // side, -(-core.x1 // side), -(-core.y1 // side))
+
+    @property
+    def piece(self) -> Rect:
+        """The samples of the level above the tier that the task hands on."""
+        return self.core.coarsened(self.tier.count)
+
+
+def choose_task_side(lattice: Lattice, workers: int) -> int:
+    """Return the side of a task [level-0 samples] that keeps ``workers`` busy and hands on as little as possible."""
+    for side in _SIDES:
+        if -(-lattice.width // side) * -(-lattice.height // side) >= _TASKS_PER_WORKER * workers:
+            return side
+    return _SIDES[-1]
+
 
 def plan_tiers(lattice: Lattice, task_side: int) -> list[Tier]:
     """Return the tiers of a pyramid: a task of ``block * 2**k`` samples a side makes k levels, at least one."""
@@ -34,14 +57,38 @@ def plan_tiers(lattice: Lattice, task_side: int) -> list[Tier]:
     return [Tier(first, min(count, lattice.levels - first), first + count < lattice.levels) for first in range(0, lattice.levels, count)]
 
 
-def plan_tasks(lattice: Lattice, tier: Tier, layout: Layout) -> Iterator[Task]:
+def _step(lattice: Lattice, tier: Tier, layout: Layout) -> tuple[int, int]:
+    """Return the width and height of a task's core."""
+    side = lattice.block << tier.count
+    return max(side, _BAND // side * side) if layout == "striped" and tier.first == 0 else side, side
+
+
+def plan_tasks(lattice: Lattice, tier: Tier, layout: Layout, within: Rect | None = None) -> Iterator[Task]:
     """Yield the tasks of a tier in row order: squares, or bands where the source's strips are decoded over their full width.
 
-    A band is at most 32768 samples wide, so that memory stays bounded; wider strips are decoded once per band.
+    A band is at most 32768 samples wide, so that memory stays bounded; wider strips are decoded once per band. ``within`` leaves
+    out the tasks whose cores do not meet these samples of the tier's first level.
     """
-    side = lattice.block << tier.count
-    width, height = lattice.level_size(tier.first)
-    step = max(side, _BAND // side * side) if layout == "striped" and tier.first == 0 else side
-    for y in range(0, height, side):
-        for x in range(0, width, step):
-            yield Task(tier, Rect(x, y, min(x + step, width), min(y + side, height)))
+    step_x, step_y = _step(lattice, tier, layout)
+    whole = lattice.level_rect(tier.first)
+    wanted = whole if within is None else within & whole
+    for y in range(wanted.y0 // step_y * step_y, wanted.y1, step_y):
+        for x in range(wanted.x0 // step_x * step_x, wanted.x1, step_x):
+            yield Task(tier, Rect(x, y, x + step_x, y + step_y) & whole)
+
+
+def count_tasks(lattice: Lattice, tiers: Iterator[Tier] | tuple[Tier, ...], layout: Layout) -> int:
+    """Return the number of tasks of all tiers."""
+    total = 0
+    for tier in tiers:
+        (width, height), (step_x, step_y) = lattice.level_size(tier.first), _step(lattice, tier, layout)
+        total += -(-width // step_x) * -(-height // step_y)
+    return total
+
+
+def plan_block_task(lattice: Lattice, tiers: tuple[Tier, ...], layout: Layout, level: int, core: Rect) -> Task:
+    """Return the task that makes the block of ``level`` whose core is ``core``."""
+    tier = next(tier for tier in tiers if tier.first <= level < tier.first + tier.count)
+    shift = level - tier.first
+    corner = Rect(core.x0 << shift, core.y0 << shift, (core.x0 << shift) + 1, (core.y0 << shift) + 1)
+    return next(plan_tasks(lattice, tier, layout, corner))

@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.region import Rect
-from tiler.sources import FileInfo
-from tiler.sources.convert import Conversion, SampleSource
+from tiler.sources.convert import DerivedSource, SampleSource
 
 
 @cache
-def _light_of_codes(top: int) -> NDArray[np.float32]:
+def light_of_codes(top: int) -> NDArray[np.float32]:
     """Return the light, 0 to 1, of every code up to ``top``."""
     code = np.arange(top + 1) / top
     return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4).astype(np.float32)
@@ -24,7 +23,7 @@ def _light_of_codes(top: int) -> NDArray[np.float32]:
 def encode_srgb(light: NDArray[np.float32], top: int) -> NDArray[np.float32]:
     """Return the codes, 0 to ``top`` and not yet rounded, of ``light``; what is outside 0 to 1 is clipped.
 
-    The code of every ``_light_of_codes`` rounds back to itself, for 8 and for 16 bits.
+    The code of every ``light_of_codes`` rounds back to itself, for 8 and for 16 bits.
     """
     light = np.clip(light, np.float32(0), np.float32(1))
     dark = light <= np.float32(0.0031308)
@@ -32,21 +31,14 @@ def encode_srgb(light: NDArray[np.float32], top: int) -> NDArray[np.float32]:
     return np.float32(top) * np.where(dark, np.float32(12.92) * light, curve)
 
 
-class LinearLight:
+class LinearLight(DerivedSource):
     """A source of 8- or 16-bit sRGB codes as light between 0 and 1."""
 
     def __init__(self, source: SampleSource) -> None:
-        self._source = source
-        self.info: FileInfo = source.info
-        self.conversion: Conversion = source.conversion
-        self.masked: bool = source.masked
-        self._light = _light_of_codes(int(np.iinfo(source.conversion.dtype).max))
+        super().__init__(source)
+        self._light = light_of_codes(int(np.iinfo(source.conversion.dtype).max))
 
     def read(self, window: Rect) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """Return light (rows, columns, channels) and coverage of ``window``."""
         codes, coverage = self._source.read(window)
         return self._light[np.clip(np.rint(codes), 0, len(self._light) - 1).astype(np.int32)], coverage
-
-    def close(self) -> None:
-        """Close the source."""
-        self._source.close()

@@ -55,9 +55,9 @@ def assemble(dataset: Dataset, name: str, level: int) -> tuple[Picture, NDArray[
 
 
 def tree_digest(folder: Path) -> str:
-    """Digest of all file names and bytes below a folder."""
+    """Digest of all file names and bytes of a dataset or a layer; task records, which say when and from where it was built, left out."""
     total = hashlib.sha256()
-    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+    for path in sorted(path for path in folder.rglob("*") if path.is_file() and "tasks" not in path.relative_to(folder).parts):
         total.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
     return total.hexdigest()
 

@@ -90,15 +90,16 @@ def test_mistakes_leave_nothing_and_cost_no_pass_over_the_file(tmp_path: Path, m
     path = write_tiff(tmp_path / "scene.tif", scene(60, 60))
     built(path, tmp_path / "out", stretch="2%")
     before = tree_digest(tmp_path / "out")
-    monkeypatch.setattr("tiler.build.find_ranges", None)
+    monkeypatch.setattr("tiler.samples.find_ranges", None)
     mistakes: list[tuple[dict[str, Any], str]] = [
-        ({"stretch": "2%"}, "already; add --overwrite"),
+        ({"stretch": "3%"}, r"other settings \(stretch was 2%, now 3%\); add --overwrite"),
         ({"stretch": "2", "overwrite": True}, "expected CUT%"),
         ({"stretch": "2%", "layer": "height", "bands": (1,), "overwrite": True}, "--stretch is for imagery"),
     ]
     for options, sentence in mistakes:
         with pytest.raises(UsageError, match=sentence):
             build_layer(path, tmp_path / "out", settings(**options))
+    assert build_layer(path, tmp_path / "out", settings(stretch="2%")).outcome == "up to date"
     assert tree_digest(tmp_path / "out") == before
 
 

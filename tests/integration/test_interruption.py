@@ -4,6 +4,7 @@ import itertools
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -28,7 +29,7 @@ from tiler.verify import verify
 def test_an_existing_layer_is_replaced_only_when_told(height_tiff: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     first = build_layer(height_tiff, out, settings())
-    with pytest.raises(UsageError, match="--overwrite"):
+    with pytest.raises(UsageError, match=r"other settings \(codec was raw, now lerc:0\.01\); add --overwrite"):
         build_layer(height_tiff, out, settings(codec="lerc"))
     second = build_layer(height_tiff, out, settings(codec="lerc", overwrite=True))
     third = build_layer(height_tiff, out, settings(overwrite=True))
@@ -124,34 +125,58 @@ def test_an_interrupt_after_the_manifest_keeps_what_it_names(height_tiff: Path, 
     monkeypatch.setattr(DirectoryStore, "sync", interrupted)
     with pytest.raises(KeyboardInterrupt):
         build_layer(height_tiff, out, settings(overwrite=True))
-    assert sorted(path.name for path in out.iterdir()) == ["height.2", MANIFEST_NAME]
+    monkeypatch.undo()
     assert verify(open_dataset(out)).findings == []
+    assert build_layer(height_tiff, out, settings()).outcome == "up to date"
+    assert sorted(path.name for path in out.iterdir()) == ["height.2", MANIFEST_NAME]
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_termination_cleans_up(number: int, tmp_path: Path) -> None:
-    """2026-11-22: schedulers and closed terminals left a lock and half a layer behind."""
+@pytest.mark.parametrize(("number", "code", "said"), [(2, 130, "interrupted"), (15, 143, "terminated"), (1, 129, "terminated")])
+def test_termination_keeps_what_is_finished(number: int, code: int, said: str, tmp_path: Path) -> None:
+    """Ctrl-C, a scheduler or a closed terminal: one sentence, what is kept, and the same command goes on from there."""
     source = write_tiff(tmp_path / "photo.tif", photo(1024, 1024, seed=8))
-    options = ["--block", "32", "--task", "64", "--codec", "png"]
-    program = "from cli.main import main; main()"
-    arguments = [sys.executable, "-c", program, "build", str(source), *options, "-o", str(tmp_path / "o")]
+    arguments = [sys.executable, "-c", "from cli.main import main; main()", "build", str(source)]
+    arguments += ["--block", "32", "--task", "64", "--codec", "png", "-o", str(tmp_path / "o")]
     process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 60
-    while not list((tmp_path / "o").glob("imagery/0/*.png")) and time.monotonic() < deadline:
+    while len(list((tmp_path / "o").glob("imagery/tasks/0/*/*.json"))) < 9 and time.monotonic() < deadline:
         time.sleep(0.01)
     process.send_signal(number)
     _, errors = process.communicate(timeout=60)
-    assert process.returncode == 128 + number
-    assert errors.strip() == "clipmap: terminated"
-    assert not (tmp_path / "o").exists()
+    assert process.returncode == code
+    first, second = errors.strip().splitlines()
+    assert first == f"clipmap: {said}"
+    assert re.fullmatch(r"note: \d+ of 342 tasks are finished and kept: the same command goes on from there", second)
+    assert not list((tmp_path / "o").rglob(".tmp-*"))
+    rerun = subprocess.run(arguments, check=True, capture_output=True, text=True)
+    assert re.search(r"layer +imagery in .*, continued: \d+ of 342 tasks were finished", rerun.stdout)
+    assert "note: went on with what process " in rerun.stderr
+    assert [path.name for path in (tmp_path / "o").glob(".*")] == []
 
 
-def test_a_failed_build_leaves_nothing(tmp_path: Path) -> None:
+def test_an_unreadable_part_of_the_source_keeps_what_is_finished(tmp_path: Path) -> None:
     """The tiles at the end of the file are cut off: noticed only when they are read, long after blocks were stored."""
+    source = write_tiff(tmp_path / "cut.tif", photo(512, 512), compress="deflate")
+    whole = source.read_bytes()
+    source.write_bytes(whole[: len(whole) * 3 // 4])
+    with pytest.raises(InputError, match=r"cut\.tif") as failure:
+        build_layer(source, tmp_path / "out", settings(workers=1, task=64))
+    assert re.fullmatch(r"\d+ of 86 tasks are finished and kept: .*", failure.value.__notes__[0])
+    with pytest.raises(NotFoundError):
+        open_dataset(tmp_path / "out")
+    source.write_bytes(whole)
+    report = build_layer(source, tmp_path / "out", settings(workers=1, task=64))
+    assert report.outcome == "continued"
+    assert report.tasks_kept >= 32
+    build_layer(source, tmp_path / "fresh", settings(workers=1, task=64))
+    assert tree_digest(tmp_path / "out") == tree_digest(tmp_path / "fresh")
+
+
+def test_a_build_that_finished_nothing_leaves_nothing(tmp_path: Path) -> None:
     source = write_tiff(tmp_path / "cut.tif", photo(512, 512), compress="deflate")
     source.write_bytes(source.read_bytes()[: source.stat().st_size * 3 // 4])
     with pytest.raises(InputError, match=r"cut\.tif"):
-        build_layer(source, tmp_path / "out", settings(workers=1, task=64))
+        build_layer(source, tmp_path / "out", settings())
     assert not (tmp_path / "out").exists()
 
 
@@ -175,7 +200,7 @@ def test_two_builds_exclude_each_other(height_tiff: Path, tmp_path: Path) -> Non
 
     def intrude(done: int, total: int) -> None:
         if done == 1:
-            with pytest.raises(StorageError, match=rf"another build is writing here \(process {os.getpid()}\)") as error:
+            with pytest.raises(StorageError, match=rf"another build is writing here \(process {os.getpid()} ") as error:
                 build_layer(height_tiff, tmp_path / "out", settings())
             refused.append(error)
 
@@ -210,34 +235,6 @@ def test_kill_leaves_no_dataset_that_opens_as_complete(tmp_path: Path) -> None:
         subprocess.run([*arguments, "-o", str(out)], check=True, capture_output=True)
     assert tree_digest(out / "imagery") == tree_digest(tmp_path / "whole/imagery")
     assert (out / MANIFEST_NAME).read_bytes() == (tmp_path / "whole" / MANIFEST_NAME).read_bytes()
-
-
-def test_interrupt_leaves_nothing(tmp_path: Path) -> None:
-    source = write_tiff(tmp_path / "photo.tif", photo(1024, 1024, seed=8))
-    arguments = [
-        sys.executable,
-        "-c",
-        BUILD,
-        "build",
-        str(source),
-        "--block",
-        "32",
-        "--task",
-        "64",
-        "--codec",
-        "png",
-        "-o",
-        str(tmp_path / "o"),
-    ]
-    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 60
-    while not list((tmp_path / "o").glob("imagery/0/*.png")) and time.monotonic() < deadline:
-        time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert errors.strip() == "clipmap: interrupted"
-    assert not (tmp_path / "o").exists()
 
 
 @pytest.mark.parametrize("layout", ["tiled", "striped"])

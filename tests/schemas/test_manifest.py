@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from schemas.address import BlockAddress
 from schemas.errors import InputError, NotFoundError
-from schemas.manifest import FORMAT_VERSION, Level, Manifest, digest, pack_availability, parse_manifest, transformed_extent
+from schemas.manifest import FORMAT_VERSION, Level, Manifest, digest, pack_bitmap, parse_manifest, transformed_extent
 from tests.schemas.sample_manifest import GENERATOR, WORLD, make_layer, make_levels, make_manifest
 
 WHERE = "some/folder/manifest.json"
@@ -59,7 +59,7 @@ def other_than(value: Any) -> Any:
         return not value
     if isinstance(value, int | float):
         return value + 1
-    if value is None:
+    if value is None or value == []:
         return 1.0
     return ("0" if value[0] != "0" else "1") + value[1:]
 
@@ -125,7 +125,7 @@ def test_an_edit_that_fits_the_model_is_told_by_the_version() -> None:
     assert "version does not match the content" in refusal(json.dumps(raw).encode())
 
 
-OPTIONAL = {"void", "clamp", "linear_light", "fill", "enhance", "stretch"}
+OPTIONAL = {"patches", "void", "clamp", "linear_light", "fill", "enhance", "stretch"}
 """Fields that say how a step was done that is left out by default; a manifest without them means the default."""
 
 
@@ -313,7 +313,7 @@ def test_availability_of_any_blocks(stored: list[bool]) -> None:
     bitmap = bytearray(-(-len(stored) // 8))
     for number, bit in enumerate(stored):
         bitmap[number // 8] |= bit << (number % 8)
-    field = pack_availability(bytes(bitmap), len(stored))
+    field = pack_bitmap(bytes(bitmap), len(stored))
     assert (field == "all") == all(stored)
     assert level_of(len(stored), field).stored_bitmap() == bytes(bitmap)
 

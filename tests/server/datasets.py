@@ -7,7 +7,7 @@ from pathlib import Path
 from schemas.address import BlockAddress, block_name
 from schemas.blockindex import BLANK, BlockRecord, pack_record
 from schemas.lattice import Lattice
-from schemas.manifest import Filter, Layer, LayerKind, Level, Manifest, Source, Statistics, World, digest, pack_availability
+from schemas.manifest import Filter, Layer, LayerKind, Level, Manifest, Source, Statistics, World, digest, pack_bitmap
 
 FORMATS: dict[LayerKind, tuple[str, str, str]] = {
     "imagery": ("webp:90", "webp", "image/webp"),
@@ -81,7 +81,7 @@ def _level(lattice: Lattice, level: int, records: list[BlockRecord], folder: Pat
         stored=sum(not record.blank for record in records),
         blank=sum(record.blank for record in records),
         stored_bytes=sum(record.length_bytes for record in records),
-        availability=pack_availability(bitmap.to_bytes(-(-len(records) // 8), "little"), len(records)),
+        availability=pack_bitmap(bitmap.to_bytes(-(-len(records) // 8), "little"), len(records)),
         index=digest(index),
     )
 

@@ -61,6 +61,12 @@ class ArraySource:
         part = np.s_[window.y0 : window.y1, window.x0 : window.x1]
         return self.values[part].copy(), None if self.coverage is None else self.coverage[part].copy()
 
+    def begin(self) -> None:
+        """Nothing to digest."""
+
+    def digest(self) -> str:
+        return ""
+
     def close(self) -> None:
         """Nothing to close."""
 

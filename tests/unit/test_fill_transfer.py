@@ -19,7 +19,7 @@ from tiler.fill import FilledSource
 from tiler.sources import FileInfo
 from tiler.sources.convert import Conversion
 from tiler.stores.dataset import open_dataset
-from tiler.transfer import LinearLight, _light_of_codes, encode_srgb
+from tiler.transfer import LinearLight, encode_srgb, light_of_codes
 
 Float32 = NDArray[np.float32]
 
@@ -43,6 +43,12 @@ class ArraySource:
     def read(self, window: Rect) -> tuple[Float32, Float32 | None]:
         part = np.s_[window.y0 : window.y1, window.x0 : window.x1]
         return self.values[part], None if self.coverage is None else self.coverage[part]
+
+    def begin(self) -> None:
+        """Nothing to digest."""
+
+    def digest(self) -> str:
+        return ""
 
     def close(self) -> None:
         """Nothing to close."""
@@ -141,7 +147,7 @@ def test_fill_is_in_the_manifest_and_changes_only_voids(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("top", [255, 65535])
 def test_every_code_survives_linear_light(top: int) -> None:
-    assert (np.rint(encode_srgb(_light_of_codes(top), top)) == np.arange(top + 1)).all()
+    assert (np.rint(encode_srgb(light_of_codes(top), top)) == np.arange(top + 1)).all()
 
 
 def test_linear_light_reads_codes_as_light() -> None:

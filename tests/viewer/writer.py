@@ -24,7 +24,7 @@ from schemas.manifest import (
     Transform,
     World,
     digest,
-    pack_availability,
+    pack_bitmap,
 )
 from tiler.codecs import BlockFormat, open_codec
 
@@ -171,7 +171,7 @@ def _write_level(
             "stored": stored,
             "blank": len(records) - stored,
             "stored_bytes": stored_bytes,
-            "availability": pack_availability(bytes(bitmap), len(records)),
+            "availability": pack_bitmap(bytes(bitmap), len(records)),
             "index": digest(index),
         }
     )

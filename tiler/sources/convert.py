@@ -4,6 +4,7 @@ Samples are float32 with a coverage between 0 (void) and 1. Void samples are set
 reach any result.
 """
 
+import threading
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import InputError, UsageError
-from schemas.manifest import LayerKind, SampleType
+from schemas.manifest import LayerKind, SampleType, digest, new_digest
 from schemas.region import Rect
 from schemas.settings import BuildSettings, HeightEncoding
 from tiler.sources import FileInfo, Pixels, Reader
@@ -68,9 +69,39 @@ class SampleSource(Protocol):
         """Return samples (rows, columns, channels) and coverage (rows, columns), None unless ``masked``."""
         ...
 
+    def begin(self) -> None:
+        """Start anew what ``digest`` covers, for this thread; nothing that was read before is held any more."""
+        ...
+
+    def digest(self) -> str:
+        """Return the digest of all pixels and masks that this thread has read from the file since ``begin``."""
+        ...
+
     def close(self) -> None:
         """Close the file."""
         ...
+
+
+class DerivedSource:
+    """Base of the sources that change the samples of another one: passes on what they leave as it is."""
+
+    def __init__(self, source: SampleSource) -> None:
+        self._source = source
+        self.info: FileInfo = source.info
+        self.conversion: Conversion = source.conversion
+        self.masked: bool = source.masked
+
+    def begin(self) -> None:
+        """Start anew what ``digest`` covers, for this thread."""
+        self._source.begin()
+
+    def digest(self) -> str:
+        """Return the digest of what this thread has read since ``begin``."""
+        return self._source.digest()
+
+    def close(self) -> None:
+        """Close the source."""
+        self._source.close()
 
 
 class Source:
@@ -80,6 +111,7 @@ class Source:
         self.info: FileInfo = reader.info
         self.conversion = conversion
         self._reader = reader
+        self._local = threading.local()
 
     @property
     def masked(self) -> bool:
@@ -90,9 +122,22 @@ class Source:
     def read(self, window: Rect) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """Return samples and coverage (rows, columns), None unless ``masked``; raises InputError if the file cannot be read."""
         pixels, mask = self._reader.read(window)
+        for part, hasher in zip((pixels, mask), getattr(self._local, "hashers", ()), strict=False):
+            if part is not None:
+                # As the file has them: a quarter of the bytes that the same samples take as float32.
+                hasher.update(np.ascontiguousarray(part).reshape(-1).view(np.uint8).data)
         colours = _chosen(pixels, self.conversion.colours)
         coverage = self._coverage(pixels, colours, mask) if self.masked else None
         return self._values(colours, coverage), coverage
+
+    def begin(self) -> None:
+        """Start anew what ``digest`` covers, for this thread."""
+        self._local.hashers = new_digest(), new_digest()
+
+    def digest(self) -> str:
+        """Return the digest of what this thread has read since ``begin``: a stretch of rows has one, however it was read in portions."""
+        pixels, masks = self._local.hashers
+        return digest(pixels.digest() + masks.digest())
 
     def close(self) -> None:
         """Close the file."""
@@ -196,7 +241,7 @@ def choose_conversion(info: FileInfo, settings: BuildSettings) -> Conversion:
         colours=colours,
         alpha=alpha,
         premultiplied=info.premultiplied and alpha is not None,
-        nodata=_nodata(info, settings),
+        nodata=void_value(info, settings.nodata),
         decode=decode,
         scale=settings.height_scale if kind == "height" else full,
         offset=settings.height_offset if kind == "height" else 0.0,
@@ -253,12 +298,13 @@ def _check_stretch(info: FileInfo, kind: LayerKind, settings: BuildSettings) -> 
         raise UsageError(f"{info.path}: has 8 bits already, and --stretch makes 8 bits of 16; leave it out")
 
 
-def _nodata(info: FileInfo, settings: BuildSettings) -> float | None:
-    """Return the value that marks voids, None if there is none or no sample of the file's type can have it.
+def void_value(info: FileInfo, given: float | None) -> float | None:
+    """Return the value that marks voids, ``given`` or declared, None if there is none or no sample of the file's type can have it.
 
-    A declared value beyond a float type's range stands for the end of that range, which is what its writer was left with.
+    A declared value beyond a float type's range stands for the end of that range, which is what its writer was left with. Raises
+    UsageError if no sample can have the ``given`` one.
     """
-    value = info.nodata if settings.nodata is None else settings.nodata
+    value = info.nodata if given is None else given
     if value is None or not np.isfinite(value):
         return None
     if info.dtype.kind == "f":
@@ -267,6 +313,6 @@ def _nodata(info: FileInfo, settings: BuildSettings) -> float | None:
     limits = np.iinfo(info.dtype)
     if value == int(value) and limits.min <= value <= limits.max:
         return value
-    if settings.nodata is not None:
+    if given is not None:
         raise UsageError(f"{info.path}: --nodata {value:g} marks nothing, no sample of {info.dtype} can have that value")
     return None

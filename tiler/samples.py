@@ -1,0 +1,64 @@
+"""From source files to the samples of a layer: which file becomes what, and what changes its samples before the pyramid is built."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from schemas.errors import UsageError
+from schemas.settings import BuildSettings
+from tiler.enhance import EnhancedSource, parse_enhancement
+from tiler.fill import FilledSource
+from tiler.sources import Reader
+from tiler.sources.convert import SampleSource, Source, choose_conversion
+from tiler.sources.disguise import refuse_disguised_heights
+from tiler.sources.files import open_file
+from tiler.sources.mosaic import open_mosaic
+from tiler.stretch import Ranges, StretchedSource, find_ranges, parse_stretch
+from tiler.transfer import LinearLight
+
+KnownRanges = Callable[[SampleSource], Ranges | None]
+"""Tells what an earlier pass over the same source found for the same stretch; None if there was none."""
+
+
+def open_samples(
+    sources: Sequence[Path], scratch: Path, settings: BuildSettings, workers: int, known_ranges: KnownRanges = lambda source: None
+) -> SampleSource:
+    """Open the source files as the samples of one layer.
+
+    A stretch by a cut reads the whole source once, unless its ranges are known. Raises UsageError or InputError.
+    """
+    reader = _open(sources, scratch, settings)
+    try:
+        source: SampleSource = Source(reader, choose_conversion(reader.info, settings))
+        if settings.decode is None:
+            refuse_disguised_heights(reader, source.conversion)
+        return _prepared(source, settings, workers, known_ranges)
+    except BaseException:
+        reader.close()
+        raise
+
+
+def _open(sources: Sequence[Path], scratch: Path, settings: BuildSettings) -> Reader:
+    if settings.mosaic:
+        return open_mosaic(sources, scratch, settings.max_samples, settings.nodata)
+    if len(sources) != 1:
+        raise UsageError(
+            f"{len(sources)} sources: add --mosaic to put them on one lattice, or build one dataset of each with clipmap batch"
+        )
+    return open_file(sources[0], scratch, settings.max_samples)
+
+
+def _prepared(source: SampleSource, settings: BuildSettings, workers: int, known_ranges: KnownRanges) -> SampleSource:
+    if settings.stretch is not None:
+        stretch = parse_stretch(settings.stretch)
+        source = StretchedSource(source, known_ranges(source) or find_ranges(source, stretch, workers))
+    if settings.fill:
+        if source.conversion.kind != "height":
+            raise UsageError("--fill is for heights; voids of imagery stay transparent")
+        source = FilledSource(source, settings.fill)
+    if settings.enhance is not None:
+        source = EnhancedSource(source, parse_enhancement(settings.enhance))
+    if settings.linear_light:
+        if source.conversion.kind != "imagery":
+            raise UsageError("--linear-light is for imagery; heights are linear already")
+        source = LinearLight(source)
+    return source
