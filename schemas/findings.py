@@ -50,6 +50,8 @@ class VerifyReport(Model):
     quick: bool = Field(description="Whether decoding was left out")
     layers: list[LayerCheck]
     findings: list[Finding]
+    repaired: list[Finding] = Field(default=[], description="What --repair mended, and what is no finding any more")
+    notes: list[str] = Field(default=[], description="Why --repair could not mend what is left")
 
 
 class FieldDifference(Model):

@@ -15,7 +15,7 @@ from tiler.measure import measure
 from tiler.records import TASKS
 from tiler.stores.dataset import Dataset
 
-REBUILD: Final = "rebuild the layer (clipmap build --overwrite)"
+REBUILD: Final = "restore it with clipmap verify --repair, or rebuild the layer (clipmap build --overwrite)"
 
 
 def finding(

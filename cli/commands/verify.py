@@ -15,9 +15,10 @@ from schemas.findings import Finding, LayerCheck, VerifyReport
 @click.option("--layer", "layers", metavar="NAME", multiple=True, help="Check this layer only; may be repeated.  [default: all]")
 @click.option("--seams", is_flag=True, help="Compare the stored borders of blocks with their neighbours; needs a layer built with --pad.")
 @click.option("--quick", is_flag=True, help="Decode nothing: compare files with their digests only.")
+@click.option("--repair", is_flag=True, help="Make what is damaged again, from the source that the layer was built from.")
 @click.option("--workers", type=click.IntRange(1, 256), help="Threads.  [default: all processors]")
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
-def command(dataset: Path, layers: tuple[str, ...], seams: bool, quick: bool, workers: int | None, as_json: bool) -> int:
+def command(dataset: Path, layers: tuple[str, ...], seams: bool, quick: bool, repair: bool, workers: int | None, as_json: bool) -> int:
     """Check that DATASET holds what it claims, and name everything that is wrong.
 
     The manifest against its version; every index against the manifest: length, digest, counts, availability; every block
@@ -29,19 +30,30 @@ def command(dataset: Path, layers: tuple[str, ...], seams: bool, quick: bool, wo
     for lossless codecs, within twice the bound for bounded ones. For jpeg, webp and exr:half, which promise no bound, the
     largest difference is told, and is no finding. In a layer without a pad there is nothing to compare.
 
+    --repair makes damaged indexes and blocks again, byte for byte, by running the tasks that made them: the source must be where it
+    was, as it was, and the dataset must have been built with records (the default). Then everything is checked again.
+
     Every finding is one line on standard output: layer/level/x/y, file, what is wrong, what to do. The exit status is 1 if there
-    is any, 0 if there is none, and 3 if the manifest itself cannot be understood.
+    is any (left), 0 if there is none, and 3 if the manifest itself cannot be understood.
 
     \b
     clipmap verify out/alps
     clipmap verify out/alps --layer height --seams
+    clipmap verify out/alps --repair
     """
     from tiler.stores.dataset import open_dataset
     from tiler.verify import Checks, verify
 
+    checks = Checks(decode=not quick, seams=seams, workers=workers)
+
     opened = open_dataset(dataset)
     with progress_bar("blocks") as on_progress:
-        report = verify(opened, layers or None, Checks(decode=not quick, seams=seams, workers=workers), on_progress)
+        if repair:
+            from tiler.repair import verify_and_repair
+
+            report = verify_and_repair(opened, layers or None, checks, on_progress)
+        else:
+            report = verify(opened, layers or None, checks, on_progress)
     if as_json:
         emit_json(report.model_dump(mode="json"))
     else:
@@ -50,8 +62,10 @@ def command(dataset: Path, layers: tuple[str, ...], seams: bool, quick: bool, wo
 
 
 def _show(report: VerifyReport) -> None:
-    for finding in report.findings:
+    for finding in [*report.repaired, *report.findings]:
         click.echo(_line(finding))
+    for note in report.notes:
+        click.echo(f"note: {note}", err=True)
     for layer in report.layers:
         if note := _seam_note(layer):
             click.echo(f"note: {layer.layer}: {note}", err=True)
@@ -60,6 +74,7 @@ def _show(report: VerifyReport) -> None:
     how = "digests only" if report.quick else "decoded"
     checked = f"{blocks} blocks of {names}, {format_bytes(sum(layer.stored_bytes for layer in report.layers))}, {how}"
     seams = sum(layer.seams_compared or 0 for layer in report.layers)
+    checked += f", {len(report.repaired)} restored" if report.repaired else ""
     checked += f", {seams} borders" if seams else ""
     if report.findings:
         count = len(report.findings)
