@@ -48,7 +48,8 @@ class World(Model):
 class Source(Model):
     """Where a layer came from."""
 
-    name: str = Field(description="File name of the source, without its folder")
+    name: str = Field(description="File name of the source, without its folder; of a mosaic, that of the first")
+    files: int = Field(default=1, ge=1, description="Number of files that a mosaic was put together from; 1 if it is none")
     format: str = Field(description="File format as its reader names it")
     width: int = Field(gt=0, description="Columns of the source [pixels]")
     height: int = Field(gt=0, description="Rows of the source [pixels]")

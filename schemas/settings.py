@@ -78,6 +78,6 @@ class BuildSettings(Settings):
 class ServerSettings(Settings):
     """What ``clipmap serve`` is told."""
 
-    roots: tuple[Path, ...] = Field(min_length=1, description="Datasets, or folders of datasets")
+    roots: tuple[str | Path, ...] = Field(min_length=1, description="Datasets, folders of datasets, or URLs of datasets")
     host: str = Field(default="127.0.0.1", description="Address to listen on")
     port: int = Field(default=8000, ge=0, le=65535, description="TCP port to listen on; 0 picks a free one")

@@ -175,6 +175,7 @@ def _source_entry(plan: Plan) -> Source:
     info, conversion = plan.source.info, plan.source.conversion
     return Source(
         name=info.path.name,
+        files=max(1, len({part.path for part in info.parts})),
         format=info.format,
         width=info.width,
         height=info.height,

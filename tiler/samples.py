@@ -37,14 +37,25 @@ def open_samples(
         raise
 
 
-def _open(sources: Sequence[Path], scratch: Path, settings: BuildSettings) -> Reader:
+def _open(sources: Sequence[Path], scratch: Path | None, settings: BuildSettings) -> Reader:
     if settings.mosaic:
-        return open_mosaic(sources, scratch, settings.max_samples, settings.nodata)
+        return open_mosaic(
+            sources,
+            scratch,
+            settings.max_samples,
+            settings.nodata,
+            kernel="bilinear" if settings.layer == "height" else None,
+            encoded=settings.decode not in (None, "none"),
+        )
+    return open_file(_only(sources), scratch, settings.max_samples)
+
+
+def _only(sources: Sequence[Path]) -> Path:
     if len(sources) != 1:
         raise UsageError(
             f"{len(sources)} sources: add --mosaic to put them on one lattice, or build one dataset of each with clipmap batch"
         )
-    return open_file(sources[0], scratch, settings.max_samples)
+    return sources[0]
 
 
 def _prepared(source: SampleSource, settings: BuildSettings, workers: int, known_ranges: KnownRanges) -> SampleSource:
@@ -62,3 +73,19 @@ def _prepared(source: SampleSource, settings: BuildSettings, workers: int, known
             raise UsageError("--linear-light is for imagery; heights are linear already")
         source = LinearLight(source)
     return source
+
+
+def open_headers(sources: Sequence[Path], settings: BuildSettings) -> SampleSource:
+    """Open the source files as ``open_samples`` does, for what their headers say: no pixel is read, nothing is decoded or found out.
+
+    A range to stretch by, if it is to be found, is any; pixels of files that cannot be read by window must not be asked for.
+    Raises UsageError or InputError.
+    """
+    reader = _open(sources, None, settings)
+    try:
+        return _prepared(
+            Source(reader, choose_conversion(reader.info, settings)), settings, 1, lambda source: ((0.0, 1.0),) * source.conversion.channels
+        )
+    except BaseException:
+        reader.close()
+        raise

@@ -1,6 +1,6 @@
 """How a layer is cut into tasks: tiers of levels, each cut into windows that can be worked on in any order."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -9,8 +9,10 @@ from schemas.region import Rect
 from tiler.sources import Layout
 
 _BAND: Final = 32768
-_SIDES: Final = (4096, 2048)
-"""Sides of tasks, the better one first: of every level-0 sample 1/256 or 1/64 sample is handed on as float32."""
+_SIDE: Final = 4096
+_LEAST_SIDE: Final = 2048
+_LARGEST_SIDE: Final = 16384
+"""Sides of tasks [level-0 samples]. With blocks of 256, of every sample 1/256 or (2048) 1/64 is handed on as float32."""
 _TASKS_PER_WORKER: Final = 4
 """So few tasks for every worker, and the last of them leaves the others idle for too long."""
 
@@ -44,11 +46,15 @@ class Task:
 
 
 def choose_task_side(lattice: Lattice, workers: int) -> int:
-    """Return the side of a task [level-0 samples] that keeps ``workers`` busy and hands on as little as possible."""
-    for side in _SIDES:
-        if -(-lattice.width // side) * -(-lattice.height // side) >= _TASKS_PER_WORKER * workers:
-            return side
-    return _SIDES[-1]
+    """Return the side of a task [level-0 samples] that keeps ``workers`` busy and hands on as little as possible.
+
+    Large blocks need large tasks: a task of four blocks hands on 1/4 of its samples, one of 64 blocks 1/64.
+    """
+    side = max(_SIDE, min(8 * lattice.block, _LARGEST_SIDE))
+    least = max(_LEAST_SIDE, 2 * lattice.block)
+    while side > least and -(-lattice.width // side) * -(-lattice.height // side) < _TASKS_PER_WORKER * workers:
+        side //= 2
+    return side
 
 
 def plan_tiers(lattice: Lattice, task_side: int) -> list[Tier]:
@@ -77,7 +83,7 @@ def plan_tasks(lattice: Lattice, tier: Tier, layout: Layout, within: Rect | None
             yield Task(tier, Rect(x, y, x + step_x, y + step_y) & whole)
 
 
-def count_tasks(lattice: Lattice, tiers: Iterator[Tier] | tuple[Tier, ...], layout: Layout) -> int:
+def count_tasks(lattice: Lattice, tiers: Iterable[Tier], layout: Layout) -> int:
     """Return the number of tasks of all tiers."""
     total = 0
     for tier in tiers:

@@ -125,7 +125,7 @@ def test_an_edit_that_fits_the_model_is_told_by_the_version() -> None:
     assert "version does not match the content" in refusal(json.dumps(raw).encode())
 
 
-OPTIONAL = {"patches", "void", "clamp", "linear_light", "fill", "enhance", "stretch"}
+OPTIONAL = {"patches", "files", "void", "clamp", "linear_light", "fill", "enhance", "stretch"}
 """Fields that say how a step was done that is left out by default; a manifest without them means the default."""
 
 

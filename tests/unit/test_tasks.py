@@ -7,11 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from schemas.address import BlockAddress
 from schemas.lattice import Lattice
+from schemas.region import Rect
 from tiler.sources import Layout
-from tiler.tasks import plan_tasks, plan_tiers
+from tiler.tasks import choose_task_side, count_tasks, plan_block_task, plan_tasks, plan_tiers
 
 SIZES = st.integers(1, 3000)
+LAYOUTS: tuple[Layout, ...] = ("tiled", "striped")
 
 
 @given(width=SIZES, height=SIZES, block=st.sampled_from([2, 16, 64, 256]), task=st.integers(2, 5000))
@@ -84,3 +87,37 @@ def test_tasks_come_in_row_order() -> None:
 def test_levels_per_tier(task: int, counts: list[int]) -> None:
     """A task of 256 * 2**k samples a side makes k levels of blocks of 256, at least one."""
     assert [tier.count for tier in plan_tiers(Lattice(4096, 100, 256), task)] == counts
+
+
+@pytest.mark.parametrize(
+    ("size", "block", "workers", "side"),
+    [
+        ((100_000, 100_000), 256, 2, 4096),
+        ((16384, 16384), 256, 2, 4096),
+        ((16384, 16384), 256, 8, 2048),
+        ((8192, 8192), 256, 2, 2048),
+        ((100, 100), 256, 64, 2048),
+        ((100_000, 100_000), 1024, 2, 8192),
+        ((8192, 8192), 1024, 2, 2048),
+        ((1 << 25, 1 << 25), 4096, 1000, 16384),
+        ((8192, 8192), 4096, 4, 8192),
+    ],
+)
+def test_tasks_are_large_where_there_are_enough_of_them(size: tuple[int, int], block: int, workers: int, side: int) -> None:
+    assert choose_task_side(Lattice(*size, block), workers) == side
+
+
+@given(
+    size=st.tuples(SIZES, SIZES), side=st.sampled_from([64, 128, 300]), level=st.integers(0, 9), x=st.integers(0, 40), y=st.integers(0, 40)
+)
+def test_every_block_has_the_task_that_makes_it(size: tuple[int, int], side: int, level: int, x: int, y: int) -> None:
+    lattice = Lattice(*size, 32)
+    level %= lattice.levels
+    columns, rows = lattice.block_counts(level)
+    address = BlockAddress(level, x % columns, y % rows)
+    tiers = tuple(plan_tiers(lattice, side))
+    for layout in LAYOUTS:
+        task = plan_block_task(lattice, tiers, layout, level, lattice.core(address))
+        made = dict(task.blocks(lattice.block))[level]
+        assert made.contains(Rect(address.x, address.y, address.x + 1, address.y + 1))
+        assert count_tasks(lattice, tiers, layout) == sum(len(list(plan_tasks(lattice, tier, layout))) for tier in tiers)

@@ -29,6 +29,14 @@ class Georeference:
 
 
 @dataclass(frozen=True, slots=True)
+class Part:
+    """A file of a mosaic and the rectangle of the mosaic's pixels outside of which it changes nothing."""
+
+    path: Path
+    window: Rect
+
+
+@dataclass(frozen=True, slots=True)
 class FileInfo:
     """What a file declares, read from its header only."""
 
@@ -57,6 +65,8 @@ class FileInfo:
     """How stored rows and columns lie in the picture, 1 to 8 as EXIF and TIFF count; 1 is upright."""
     least_bytes: int = 0
     """What the samples take if they are not compressed, 0 if unknown; a smaller file is cut off [bytes]."""
+    parts: tuple[Part, ...] = ()
+    """The files of a mosaic, lowest first; one that shows on both sides of the antimeridian appears twice. Empty for one file."""
 
     @property
     def largest(self) -> int:

@@ -26,11 +26,12 @@ _PICTURE_DRIVERS = {"PNG", "JPEG", "GIF", "BMP", "TGA"}
 """GDAL drivers for formats of which OpenImageIO has the last word: it notices truncation."""
 
 
-def open_file(path: Path, scratch: Path, max_samples: int = MAX_SAMPLES) -> Reader:
+def open_file(path: Path, scratch: Path | None, max_samples: int = MAX_SAMPLES) -> Reader:
     """Open ``path`` for windowed reading; only its header is read, unless its format cannot be read by window.
 
-    Such a file is decoded once into memory or into ``scratch``. Raises InputError if the file does not exist, is of no known
-    format, damaged, or declares more samples than ``max_samples`` or than its bytes can hold.
+    Such a file is decoded once into memory or into ``scratch``; if that is None it is not, and only the reader's ``info`` is of use.
+    Raises InputError if the file does not exist, is of no known format, damaged, or declares more samples than ``max_samples`` or
+    than its bytes can hold.
     """
     _check_readable(path)
     geographic = geo.describe(path)
@@ -57,7 +58,7 @@ def open_file(path: Path, scratch: Path, max_samples: int = MAX_SAMPLES) -> Read
     return reader if picture.orientation == 1 else OrientedReader(reader, picture.orientation)
 
 
-def _stored(picture: FileInfo, geographic: FileInfo | None, scratch: Path) -> Reader:
+def _stored(picture: FileInfo, geographic: FileInfo | None, scratch: Path | None) -> Reader:
     """Return a reader of rows and columns as they are stored."""
     if picture.orientation in TRANSPOSING and picture.layout == "striped":
         # A column of a striped file costs as much as the whole.
@@ -112,8 +113,8 @@ def _located(picture: FileInfo, geographic: FileInfo) -> FileInfo:
     return replace(picture, nodata=geographic.nodata, has_mask=geographic.has_mask, georeference=georeference, alpha=alpha)
 
 
-def _windowed(reader: Reader, scratch: Path) -> Reader:
-    return SpooledReader(reader, scratch) if reader.info.layout == "sequential" else reader
+def _windowed(reader: Reader, scratch: Path | None) -> Reader:
+    return SpooledReader(reader, scratch) if scratch is not None and reader.info.layout == "sequential" else reader
 
 
 def _check_complete(info: FileInfo) -> None:
