@@ -173,7 +173,8 @@ def source_text(source: Source) -> str:
     ranges = [] if source.stretch is None else [f"{low:g} to {high:g}" for low, high in source.stretch]
     stretch = f", stretched from {' and '.join(dict.fromkeys(ranges))}" if ranges else ""
     samples = f"{source.channels} x {source.dtype}"
-    return f"{source.name}, {source.format}, {samples}{nodata}{decode}{scale}{stretch}, {source.placement}"
+    more = f" and {source.files - 1} more" if source.files > 1 else ""
+    return f"{source.name}{more}, {source.format}, {samples}{nodata}{decode}{scale}{stretch}, {source.placement}"
 
 
 def _geographic(longitude: float, latitude: float) -> str:

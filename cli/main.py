@@ -14,6 +14,7 @@ from schemas.errors import ClipmapError
 
 COMMANDS: Final = {
     "build": "Build a layer of a dataset from a source image or elevation model.",
+    "batch": "Build many datasets, side by side, with one report.",
     "inspect": "Show a dataset, a level, a block or the values at a place.",
     "verify": "Check a dataset: files, digests, samples, seams.",
     "diff": "Compare two datasets: fields, blocks, samples.",
