@@ -15,7 +15,9 @@ from tiler.measure import measure
 from tiler.records import TASKS
 from tiler.stores.dataset import Dataset
 
-REBUILD: Final = "restore it with clipmap verify --repair, or rebuild the layer (clipmap build --overwrite)"
+REBUILD: Final = "rebuild the layer (clipmap build --overwrite)"
+RESTORE: Final = "restore it with clipmap verify --repair, or rebuild the layer (clipmap build --overwrite)"
+"""What helps where bytes differ from their digest: they can be made again, and checked against it."""
 
 
 def finding(
@@ -63,8 +65,8 @@ def check_index(dataset: Dataset, name: str, number: int) -> tuple[BlockIndex | 
     level = layer.levels[number]
     blocks = level.columns * level.rows
 
-    def wrong(kind: FindingKind, what: str, file: str | None = None) -> Finding:
-        return finding(kind, dataset, name, what, REBUILD, level=number, file=file)
+    def wrong(kind: FindingKind, what: str) -> Finding:
+        return finding(kind, dataset, name, what, RESTORE, level=number)
 
     skipped = f"the level's {blocks} blocks were not checked"
     try:
@@ -78,7 +80,7 @@ def check_index(dataset: Dataset, name: str, number: int) -> tuple[BlockIndex | 
     if digest(data) != level.index:
         return None, [wrong("index", f"differs from the digest in the manifest; {skipped}")]
     index = BlockIndex(data, blocks, layer.index_key(number))
-    return index, [wrong(kind, what, "manifest.json") for kind, what in _against_manifest(level, index)]
+    return index, [finding(kind, dataset, name, what, REBUILD, level=number, file="manifest.json") for kind, what in _against_manifest(level, index)]
 
 
 def _against_manifest(level: Level, index: BlockIndex) -> list[tuple[FindingKind, str]]:
@@ -159,13 +161,13 @@ def read_checked(dataset: Dataset, name: str, address: BlockAddress, record: Blo
     try:
         data = dataset.store.read(dataset.manifest.layer(name).block_key(name, address))
     except NotFoundError:
-        return finding("missing", dataset, name, "the file is missing", REBUILD, address)
+        return finding("missing", dataset, name, "the file is missing", RESTORE, address)
     except StorageError as error:
         return finding("unreadable", dataset, name, str(error), "check the disk and the file's permissions", address)
     if len(data) != record.length_bytes:
-        return finding("length", dataset, name, f"has {len(data)} bytes, the index says {record.length_bytes}", REBUILD, address)
+        return finding("length", dataset, name, f"has {len(data)} bytes, the index says {record.length_bytes}", RESTORE, address)
     if digest(data) != record.digest:
-        return finding("digest", dataset, name, "differs from the digest in the index", REBUILD, address)
+        return finding("digest", dataset, name, "differs from the digest in the index", RESTORE, address)
     return data
 
 
