@@ -7,10 +7,11 @@ from starlette.responses import Response
 
 from schemas.address import BlockAddress, parse_block_name
 from schemas.errors import InputError, NotFoundError
-from server.catalog import Catalog, PublishedDataset
+from server.catalog import Catalog
 from server.conditional import IMMUTABLE, REVALIDATE, Representation, answer
 from server.cors import CORS_HEADERS
 from server.problems import DamagedError, StaleVersionError
+from server.slots import PublishedDataset
 
 _ATTEMPTS: Final = 3
 """How often a dataset may be rebuilt under one request before it is given up."""

@@ -1,129 +1,54 @@
 """Which datasets there are, and which version of each is current.
 
 Datasets come, go and are rebuilt while the service runs. Every request costs one ``stat`` of the manifest, the commit
-point of a build; the manifest is read again only if it changed. A manifest that becomes unreadable or damaged does not
-take the dataset away from running viewers: its blocks are still there, so the last good version stays in service, and
-the log and the catalogue say what is wrong. A manifest that was never good is answered with 503.
+point of a build, or a look at an object store that is a second old at most; the manifest is read again only if it
+changed. A manifest that becomes unreadable or damaged does not take the dataset away from running viewers: its blocks are
+still there, so the last good version stays in service, and the log and the catalogue say what is wrong. A manifest that was
+never good is answered with 503.
 """
 
 import logging
 import os
 import threading
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from schemas.errors import ClipmapError, InputError, NotFoundError, StorageError, UsageError
-from schemas.manifest import MANIFEST_NAME, digest
+from schemas.errors import InputError, NotFoundError, StorageError, UsageError
+from schemas.manifest import MANIFEST_NAME
 from server.problems import UnavailableError
-from tiler.stores.dataset import Dataset, open_dataset
+from server.remote import RemoteSlot, dataset_name, reads_each
+from server.slots import FolderSlot, PublishedDataset, Slot, State
+from tiler.stores.dataset import open_dataset
+from tiler.stores.locate import folder_of, is_remote
 
 _log: Final = logging.getLogger(__name__)
 
-_Stamp = tuple[int, int, int]
-"""Modification time [ns], size [bytes] and inode of a manifest; a renamed-over file has another inode."""
-_NO_MANIFEST: Final[_Stamp] = (0, 0, 0)
-_LOOK_AGAIN: Final[_Stamp] = (0, 0, -1)
-"""Equals no file's stamp: the next request reads the manifest again."""
-
-
-@dataclass(frozen=True, slots=True)
-class PublishedDataset:
-    """One version of a dataset, as it is served; a rebuilt dataset is another object."""
-
-    name: str
-    dataset: Dataset
-    manifest_json: bytes
-    manifest_etag: str
-
-    @property
-    def version(self) -> str:
-        """The manifest's version."""
-        return self.dataset.manifest.version
-
-
-@dataclass(frozen=True, slots=True)
-class _State:
-    stamp: _Stamp
-    published: PublishedDataset | None
-    problem: str | None
-
-
-class _Slot:
-    """The place of one dataset in the catalogue; safe to use from several threads."""
-
-    def __init__(self, name: str, path: Path) -> None:
-        self.path = path
-        self._name = name
-        self._manifest = os.fspath(path / MANIFEST_NAME)
-        self._lock = threading.Lock()
-        self._state = _State(_NO_MANIFEST, None, None)
-
-    @property
-    def state(self) -> _State:
-        """What was last seen."""
-        return self._state
-
-    def refreshed(self) -> _State:
-        """Return what is there now; reads the manifest only if it changed."""
-        if self._stamp() == self._state.stamp:
-            return self._state
-        with self._lock:
-            # The stamp is taken before the manifest is read: one that is replaced in between is read again next time.
-            stamp = self._stamp()
-            if stamp != self._state.stamp:
-                self._state = self._reopened(stamp)
-            return self._state
-
-    def _stamp(self) -> _Stamp:
-        try:
-            status = os.stat(self._manifest)
-        except (FileNotFoundError, NotADirectoryError):
-            return _NO_MANIFEST
-        except OSError:
-            return _LOOK_AGAIN
-        return status.st_mtime_ns, status.st_size, status.st_ino
-
-    def _reopened(self, stamp: _Stamp) -> _State:
-        if stamp == _NO_MANIFEST:
-            return _State(stamp, None, None)
-        try:
-            dataset = open_dataset(self.path)
-        except NotFoundError:
-            return _State(_NO_MANIFEST, None, None)
-        except ClipmapError as error:
-            return self._failed(stamp, error)
-        manifest_json = dataset.manifest.to_json()
-        return _State(stamp, PublishedDataset(self._name, dataset, manifest_json, f'"{digest(manifest_json)}"'), None)
-
-    def _failed(self, stamp: _Stamp, error: ClipmapError) -> _State:
-        last = self._state.published
-        if str(error) != self._state.problem:
-            _log.error("%s%s", error, f"; version {last.version} stays in service" if last else "")
-        # A damaged file stays damaged until it is replaced; an unreadable one may recover without a trace in its stamp.
-        return _State(_LOOK_AGAIN if isinstance(error, StorageError) else stamp, last, str(error))
-
 
 class Catalog:
-    """The datasets below ``roots``, by name; a root is a dataset or a folder of datasets.
+    """The datasets of ``roots``, by name; a root is a dataset, a folder of datasets, or the URL of a dataset.
 
-    A dataset is called as its folder. Folders with a leading dot are skipped. Raises NotFoundError, InputError or
-    StorageError for a root that cannot be used, UsageError if two datasets have one name. A name that turns up twice
-    while the service runs stays with the dataset that had it first.
+    A dataset is called as its folder, or as the last part of its URL. Folders with a leading dot are skipped. Raises
+    NotFoundError, InputError or StorageError for a root that cannot be used, UsageError if two datasets have one name. A name that turns
+    up twice while the service runs stays with the dataset that had it first.
     """
 
-    def __init__(self, roots: Sequence[Path]) -> None:
-        self._roots = tuple(Path(os.path.abspath(root)) for root in roots)
+    def __init__(self, roots: Sequence[str | Path]) -> None:
+        urls = list(dict.fromkeys(str(root).rstrip("/") for root in roots if is_remote(root)))
+        self._roots = tuple(Path(os.path.abspath(folder_of(root))) for root in roots if not is_remote(root))
         self._lock = threading.Lock()
-        self._slots: dict[str, _Slot] = {}
+        self._slots: dict[str, Slot] = {}
         for root in self._roots:
             _check_root(root)
         for path in self._dataset_folders():
-            known = self._slots.setdefault(path.name, _Slot(path.name, path))
-            if known.path != path and not known.path.samefile(path):
-                raise UsageError(f"{known.path} and {path} are both called {path.name!r}; rename one of the folders")
+            known = self._slots.setdefault(path.name, FolderSlot(path.name, path))
+            if known.where != str(path) and not Path(known.where).samefile(path):
+                raise _same_name(known.where, str(path), path.name)
             known.refreshed()
+        for url in urls:
+            slot = RemoteSlot(url, reads_each(len(urls)))
+            if (known := self._slots.setdefault(name := dataset_name(slot.where), slot)) is not slot:
+                raise _same_name(known.where, slot.where, name)
 
     def names(self) -> list[str]:
         """Return the datasets in service when they were last looked at; costs no look at the disk."""
@@ -137,7 +62,7 @@ class Catalog:
         """
         slot = self._slots.get(name)
         state = slot.refreshed() if slot else None
-        if state is None or state.stamp == _NO_MANIFEST:
+        if state is None or state.absent:
             path = next((path for path in self._candidates() if path.name == name and _has_manifest(path)), None)
             if path is None:
                 raise NotFoundError(f"no dataset {name!r}; /datasets lists those there are")
@@ -150,16 +75,19 @@ class Catalog:
         """Return the datasets in service, by name, and (name, what is wrong) of those whose manifest cannot be read."""
         for path in self._dataset_folders():
             self._slot(path)
-        states = [(name, slot.refreshed()) for name, slot in sorted(self._slots.copy().items())]
+        slots = sorted(self._slots.copy().items())
+        for _, slot in slots:
+            slot.look()  # all at once, so that several slow stores cost no more time than one
+        states = [(name, slot.refreshed()) for name, slot in slots]
         published = [state.published for _, state in states if state.published is not None]
         problems = [(name, _problem_text(state)) for name, state in states if state.problem is not None]
         return published, problems
 
-    def _slot(self, path: Path) -> _Slot:
+    def _slot(self, path: Path) -> Slot:
         with self._lock:
             known = self._slots.get(path.name)
-            if known is None or (known.path != path and known.refreshed().stamp == _NO_MANIFEST):
-                known = self._slots[path.name] = _Slot(path.name, path)
+            if known is None or (isinstance(known, FolderSlot) and known.where != str(path) and known.refreshed().absent):
+                known = self._slots[path.name] = FolderSlot(path.name, path)
             return known
 
     def _candidates(self) -> Iterator[Path]:
@@ -177,6 +105,10 @@ class Catalog:
 
     def _dataset_folders(self) -> Iterator[Path]:
         return filter(_has_manifest, self._candidates())
+
+
+def _same_name(one: str, other: str, name: str) -> UsageError:
+    return UsageError(f"{one} and {other} are both called {name!r}; rename one of them")
 
 
 def _check_root(root: Path) -> None:
@@ -208,6 +140,6 @@ def _servable(name: str) -> bool:
     return not name.startswith(".")
 
 
-def _problem_text(state: _State) -> str:
+def _problem_text(state: State) -> str:
     kept = f"version {state.published.version} stays in service" if state.published else "it is not served"
     return f"the manifest cannot be read; {kept}; the service's log says why"

@@ -6,7 +6,8 @@ from urllib.parse import quote
 from pydantic import BaseModel, Field
 
 from schemas.manifest import Layer, LayerKind
-from server.catalog import Catalog, PublishedDataset
+from server.catalog import Catalog
+from server.slots import PublishedDataset
 
 
 class LayerSummary(BaseModel):

@@ -104,7 +104,7 @@ BLOCK_RESPONSES: Final[Responses] = {
     410: _problem("`v` is not the current version: the dataset was rebuilt. Read the manifest again and drop blocks of the old version"),
     416: _problem("The range begins behind the last byte", Content_Range="`bytes */all`"),
     500: _problem("The block or its index is damaged or missing; the sentence says which block"),
-    503: _problem("The dataset's manifest has not been readable since the service started"),
+    503: _problem("The dataset's manifest has not been readable since the service started, or its object store fails or is too slow"),
     "default": _DEFAULT,
 }
 MANIFEST_RESPONSES: Final[Responses] = {

@@ -5,9 +5,13 @@ import sys
 from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import settings
+
+if TYPE_CHECKING:
+    from tests.s3 import S3Server
 
 settings.register_profile("local", deadline=None)
 settings.register_profile("ci", deadline=None, derandomize=True, database=None, print_blob=True)
@@ -31,3 +35,20 @@ def data_dir() -> Path:
     folder = Path(name)
     assert folder.is_dir(), f"CLIPMAP_TEST_DATA={name} is not a folder"
     return folder
+
+
+@pytest.fixture(scope="session")
+def s3_process() -> "Iterator[S3Server]":
+    """An S3-speaking server on loopback, one per worker; ``s3`` also makes it known to the code under test."""
+    from tests.s3 import s3_server
+
+    with s3_server() as server:
+        yield server
+
+
+@pytest.fixture
+def s3(s3_process: "S3Server", monkeypatch: pytest.MonkeyPatch) -> "S3Server":
+    """An S3-speaking server on loopback, and an environment in which ``s3://`` URLs lead there."""
+    for name, value in s3_process.environment.items():
+        monkeypatch.setenv(name, value)
+    return s3_process

@@ -19,7 +19,7 @@ MAX_LINES = 400
 LONGER: dict[str, str] = {}
 """Files that may be longer, and why."""
 VAGUE_NAMES = {"utils", "util", "helpers", "helper", "manager", "managers", "common", "misc"}
-HEAVY = {"numba", "numpy", "OpenImageIO", "OpenEXR", "rasterio", "imagecodecs", "fastapi", "uvicorn", "pydantic_settings", "moderngl"}
+HEAVY = {"numba", "obstore", "numpy", "OpenImageIO", "OpenEXR", "rasterio", "imagecodecs", "fastapi", "uvicorn", "pydantic_settings", "moderngl"}
 BUILT = {".venv", ".git", "__pycache__", ".mypy_cache", ".ruff_cache", ".pytest_cache", ".hypothesis", ".import_linter_cache"}
 
 
@@ -62,7 +62,7 @@ def test_imports_go_one_way() -> None:
 def test_everything_imports_without_extras() -> None:
     """An installation without the extras can import every module but the viewer's."""
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    optional = {re.split(r"[<>=\[]", line)[0].replace("-", "_") for name in ("view", "dask", "report") for line in extras[name]}
+    optional = {re.split(r"[<>=\[]", line)[0].replace("-", "_") for name in ("view", "dask", "report", "cloud") for line in extras[name]}
     optional.add("pywt")  # of PyWavelets
     assert "moderngl" in optional
     code = f"""

@@ -1,7 +1,6 @@
 """``clipmap diff``: how two datasets differ."""
 
 import json
-from pathlib import Path
 
 import click
 from pydantic import JsonValue
@@ -15,16 +14,17 @@ _LONGEST_VALUE = 60
 
 
 @click.command(short_help="Compare two datasets: fields, blocks, samples.")
-@click.argument("a", type=click.Path(path_type=Path))
-@click.argument("b", type=click.Path(path_type=Path))
+@click.argument("a")
+@click.argument("b")
 @click.option("--workers", type=click.IntRange(1, 256), help="Threads.  [default: all processors]")
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
-def command(a: Path, b: Path, workers: int | None, as_json: bool) -> int:
+def command(a: str, b: str, workers: int | None, as_json: bool) -> int:
     """Say how the datasets A and B differ: layers, fields of the manifest, blocks, samples.
 
-    Blocks are compared by their digests. Where both datasets have a layer on the same lattice, the blocks that differ are decoded,
-    and the largest and the root-mean-square difference of their samples are told, level by level; so two codecs or filters can be
-    compared. Where blocks lie in the store and which version of clipmap wrote them does not count.
+    Each is a folder, or a URL of an object store such as s3://bucket/prefix. Blocks are compared by their digests. Where both datasets
+    have a layer on the same lattice, the blocks that differ are decoded, and the largest and the root-mean-square difference of their
+    samples are told, level by level; so two codecs or filters can be compared. Where blocks lie in the store and which version of
+    clipmap wrote them does not count.
 
     The exit status is 0 if the datasets are the same, 1 if they differ.
 

@@ -38,7 +38,7 @@ def _whole_pair(context: click.Context, parameter: click.Parameter, value: str |
 
 
 @click.command(short_help="Show a dataset, a level, a block or the values at a place.")
-@click.argument("dataset", type=click.Path(path_type=Path))
+@click.argument("dataset")
 @click.argument("target", required=False)
 @click.option("--at", metavar="LON,LAT", callback=_pair, help="Values at a place in WGS 84, in degrees.")
 @click.option("--at-world", metavar="X,Y", callback=_pair, help="Values at a place in the dataset's own coordinates.")
@@ -46,7 +46,7 @@ def _whole_pair(context: click.Context, parameter: click.Parameter, value: str |
 @click.option("--png", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Write the block's picture to FILE.")
 @click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
 def command(
-    dataset: Path,
+    dataset: str,
     target: str | None,
     at: Pair | None,
     at_world: Pair | None,
@@ -54,7 +54,7 @@ def command(
     png: Path | None,
     as_json: bool,
 ) -> int:
-    """Show what is in DATASET, or in one part of it, or at one place.
+    """Show what is in DATASET, a folder or the URL of an object store, or in one part of it, or at one place.
 
     TARGET is a layer, a level, or a block by address or by name. A level is drawn as a map of its blocks. A block is decoded, and
     its bytes are compared with their digest; the exit status is 1 if it is damaged. --png writes its core: imagery as it is, 16 bits

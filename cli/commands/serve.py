@@ -1,7 +1,6 @@
 """``clipmap serve``: the block service in this process."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Final
 
 import click
@@ -11,15 +10,16 @@ _NAMES_SHOWN: Final = 8
 
 
 @click.command()
-@click.argument("roots", metavar="DATASET_OR_DIR...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("roots", metavar="DATASET_OR_DIR...", nargs=-1, required=True)
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on; 0.0.0.0 for every network of this machine.")
 @click.option("--port", default=8000, show_default=True, type=click.IntRange(0, 65535), help="TCP port to listen on; 0 picks a free one.")
 @click.option("--log-level", default="warning", show_default=True, type=click.Choice(LOG_LEVELS), help="'info' logs every request.")
-def command(roots: tuple[Path, ...], host: str, port: int, log_level: str) -> None:
+def command(roots: tuple[str, ...], host: str, port: int, log_level: str) -> None:
     """Serve datasets over HTTP until Ctrl-C or SIGTERM.
 
-    DATASET_OR_DIR is a dataset or a folder of datasets. Datasets that are added to such a folder, rebuilt or removed are
-    noticed without a restart. Blocks are handed out as they are stored, to everyone who can reach the address.
+    DATASET_OR_DIR is a dataset, a folder of datasets, or the URL of a dataset in an object store, such as s3://bucket/alps, which is
+    then called alps. Datasets that are added to such a folder, rebuilt or removed are noticed without a restart. Blocks are
+    handed out as they are stored, to everyone who can reach the address.
     """
     import logging
 

@@ -1,7 +1,5 @@
 """``clipmap verify``: whether a dataset holds what it claims."""
 
-from pathlib import Path
-
 import click
 
 from cli.exit_codes import DONE, FOUND
@@ -11,15 +9,15 @@ from schemas.findings import Finding, LayerCheck, VerifyReport
 
 
 @click.command(short_help="Check a dataset: files, digests, samples, seams.")
-@click.argument("dataset", type=click.Path(path_type=Path))
+@click.argument("dataset")
 @click.option("--layer", "layers", metavar="NAME", multiple=True, help="Check this layer only; may be repeated.  [default: all]")
 @click.option("--seams", is_flag=True, help="Compare the stored borders of blocks with their neighbours; needs a layer built with --pad.")
 @click.option("--quick", is_flag=True, help="Decode nothing: compare files with their digests only.")
 @click.option("--repair", is_flag=True, help="Make what is damaged again, from the source that the layer was built from.")
 @click.option("--workers", type=click.IntRange(1, 256), help="Threads.  [default: all processors]")
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
-def command(dataset: Path, layers: tuple[str, ...], seams: bool, quick: bool, repair: bool, workers: int | None, as_json: bool) -> int:
-    """Check that DATASET holds what it claims, and name everything that is wrong.
+def command(dataset: str, layers: tuple[str, ...], seams: bool, quick: bool, repair: bool, workers: int | None, as_json: bool) -> int:
+    """Check that DATASET, a folder or the URL of an object store, holds what it claims, and name everything that is wrong.
 
     The manifest against its version; every index against the manifest: length, digest, counts, availability; every block
     against the index: its file, length and digest, that it can be decoded, and the number and the range of its valid samples,

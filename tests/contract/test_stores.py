@@ -1,4 +1,4 @@
-"""The contract of a store. A new store subclasses ``StoreContract`` in a few lines and gets every test."""
+"""The store in a directory: the contract, and what is a directory's own."""
 
 import errno
 import os
@@ -6,189 +6,18 @@ import resource
 import signal
 import subprocess
 import sys
-import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
-from schemas.errors import NotFoundError, StorageError
-from tiler.stores import Store
+from schemas.errors import StorageError
+from tests.contract.stores import StoreContract
+from tiler.stores.claims import ClaimNote, utc_now
 from tiler.stores.directory import DirectoryStore
-
-NOT_KEYS = [
-    "",
-    "/",
-    "/a",
-    "a/",
-    "a//b",
-    ".",
-    "..",
-    "../a",
-    "a/..",
-    "a/../b",
-    "./a",
-    "a/./b",
-    ".tmp-1-2-a",
-    "a/.tmp-x",
-    ".hidden",
-    "a\0b",
-    "\0",
-]
-part = st.text("abcxyz0189_-.", min_size=1, max_size=8).filter(lambda text: not text.startswith("."))
-
-
-class StoreContract:
-    """Tests of any store; ``set`` and ``get`` reach the stored bytes past the store, so that it cannot vouch for itself."""
-
-    def store(self, place: Path) -> Store:
-        raise NotImplementedError
-
-    def set(self, place: Path, key: str, data: bytes) -> None:
-        raise NotImplementedError
-
-    def get(self, place: Path, key: str) -> bytes:
-        raise NotImplementedError
-
-    def test_read(self, tmp_path: Path) -> None:
-        self.set(tmp_path, "layer/0/a.png", b"old")
-        store = self.store(tmp_path)
-        assert store.read("layer/0/a.png") == b"old"
-        self.set(tmp_path, "layer/0/a.png", b"new bytes")
-        assert store.read("layer/0/a.png") == b"new bytes"
-
-    @pytest.mark.parametrize("data", [b"", b"\0", bytes(range(256)) * 5000])
-    def test_write(self, tmp_path: Path, data: bytes) -> None:
-        store = self.store(tmp_path)
-        store.write("layer/0/a.png", data)
-        assert self.get(tmp_path, "layer/0/a.png") == store.read("layer/0/a.png") == data
-
-    def test_write_replaces(self, tmp_path: Path) -> None:
-        self.set(tmp_path, "a", b"a longer value than the next one")
-        store = self.store(tmp_path)
-        store.write("a", b"short")
-        assert self.get(tmp_path, "a") == b"short"
-        assert store.keys("") == ["a"]
-
-    @pytest.mark.parametrize("buffer", [bytearray, memoryview])
-    def test_write_takes_any_buffer(self, tmp_path: Path, buffer: Callable[[bytes], bytes]) -> None:
-        self.store(tmp_path).write("a", buffer(b"bytes"))
-        assert self.get(tmp_path, "a") == b"bytes"
-
-    def test_what_is_not_there(self, tmp_path: Path) -> None:
-        self.set(tmp_path, "a/b", b"x")
-        store = self.store(tmp_path)
-        for key in ("b", "a", "a/c", "a/b/c", "c/d/e"):
-            with pytest.raises(NotFoundError, match=key):
-                store.read(key)
-        with pytest.raises(NotFoundError):
-            self.store(tmp_path / "nowhere").read("a")
-
-    @pytest.mark.parametrize("key", NOT_KEYS)
-    def test_keys_are_plain_relative_paths(self, tmp_path: Path, key: str) -> None:
-        place = tmp_path / "in" / "side"
-        self.set(place, "a/b", b"x")
-        store = self.store(place)
-        with pytest.raises(NotFoundError, match="is not a key"):
-            store.read(key)
-        with pytest.raises(NotFoundError, match="is not a key"):
-            store.write(key, b"y")
-        with pytest.raises(NotFoundError, match="is not a key"):
-            store.delete_prefix(key)
-        if key:
-            with pytest.raises(NotFoundError, match="is not a key"):
-                store.keys(key)
-        assert self.get(place, "a/b") == b"x"
-        assert store.keys("") == ["a/b"]
-
-    def test_keys(self, tmp_path: Path) -> None:
-        keys = ["a.1/0/x", "a/0/x", "a/0/y", "a/1/x", "ab/0/x", "manifest.json"]
-        for key in reversed(keys):
-            self.set(tmp_path, key, b"")
-        store = self.store(tmp_path)
-        assert store.keys("") == sorted(keys)
-        assert store.keys("a") == ["a/0/x", "a/0/y", "a/1/x"]
-        assert store.keys("a/0") == ["a/0/x", "a/0/y"]
-        assert store.keys("nothing") == store.keys("manifest.json") == []
-        assert self.store(tmp_path / "nowhere").keys("") == []
-
-    def test_delete_prefix(self, tmp_path: Path) -> None:
-        for key in ("a/0/x", "a/1/x", "ab/0/x", "manifest.json"):
-            self.set(tmp_path, key, b"kept")
-        store = self.store(tmp_path)
-        store.delete_prefix("a")
-        store.delete_prefix("a")
-        store.delete_prefix("manifest.json")
-        assert store.keys("") == ["ab/0/x", "manifest.json"]
-        assert self.get(tmp_path, "manifest.json") == b"kept"
-        with pytest.raises(NotFoundError):
-            store.read("a/0/x")
-        store.write("a/0/x", b"again")
-        assert self.get(tmp_path, "a/0/x") == b"again"
-
-    def test_location_tells_stores_apart(self, tmp_path: Path) -> None:
-        assert str(tmp_path / "one") in self.store(tmp_path / "one").location
-
-    def test_what_is_synchronised_is_still_there(self, tmp_path: Path) -> None:
-        store = self.store(tmp_path)
-        store.write("a", b"x")
-        store.sync()
-        assert self.get(tmp_path, "a") == b"x"
-
-    @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
-    @given(entries=st.dictionaries(st.lists(part, min_size=1, max_size=3).map("/".join), st.binary(max_size=64), max_size=8))
-    def test_a_store_is_a_dictionary(self, tmp_path_factory: pytest.TempPathFactory, entries: dict[str, bytes]) -> None:
-        # A path cannot be both a key and the beginning of another one.
-        entries = {key: data for key, data in entries.items() if not any(other.startswith(f"{key}/") for other in entries)}
-        store = self.store(tmp_path_factory.mktemp("store"))
-        for key, data in entries.items():
-            store.write(key, data)
-        assert store.keys("") == sorted(entries)
-        assert {key: store.read(key) for key in entries} == entries
-
-    def test_a_reader_never_sees_a_part(self, tmp_path: Path) -> None:
-        values = [bytes([value]) * (300_000 + 100_000 * value) for value in range(3)]
-        store = self.store(tmp_path)
-        store.write("a/block", values[0])
-        done = threading.Event()
-
-        def write() -> None:
-            for turn in range(150):
-                store.write("a/block", values[turn % 3])
-            done.set()
-
-        def read() -> set[bytes]:
-            seen = set()
-            while not done.is_set():
-                seen.add(store.read("a/block"))
-            return seen
-
-        with ThreadPoolExecutor(3) as pool:
-            readers = [pool.submit(read), pool.submit(read)]
-            pool.submit(write).result()
-            seen = set.union(*(reader.result() for reader in readers))
-        assert seen <= set(values)
-        assert len(seen) > 1, "the readers never ran beside the writer"
-
-    def test_concurrent_writers_of_one_key(self, tmp_path: Path) -> None:
-        values = [bytes([value]) * 50_000 for value in range(8)]
-        store, other = self.store(tmp_path), self.store(tmp_path)
-        with ThreadPoolExecutor(8) as pool:
-            list(pool.map(lambda turn: (store, other)[turn % 2].write("a/b/block", values[turn % 8]), range(200)))
-        assert self.get(tmp_path, "a/b/block") in values
-        assert store.keys("") == ["a/b/block"]
-
-    def test_concurrent_writers_of_many_keys(self, tmp_path: Path) -> None:
-        keys = [f"a/{number % 7}/{number}" for number in range(300)]
-        store = self.store(tmp_path)
-        with ThreadPoolExecutor(8) as pool:
-            list(pool.map(lambda key: store.write(key, key.encode()), keys))
-        assert store.keys("") == sorted(keys)
-        assert all(self.get(tmp_path, key) == key.encode() for key in keys)
 
 
 class TestDirectoryStore(StoreContract):
@@ -202,6 +31,9 @@ class TestDirectoryStore(StoreContract):
 
     def get(self, place: Path, key: str) -> bytes:
         return (place / key).read_bytes()
+
+    def left(self, place: Path) -> list[str]:
+        return sorted(path.relative_to(place).as_posix() for path in place.rglob("*") if path.is_file())
 
     def test_nothing_is_made_before_the_first_write(self, tmp_path: Path) -> None:
         store = self.store(tmp_path / "new")
@@ -308,23 +140,6 @@ for turn in range(10**9):
             self.store(tmp_path).write("c", b"new")
         assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "c"]
 
-    def test_one_build_at_a_time(self, tmp_path: Path) -> None:
-        place = tmp_path / "new"
-        with self.store(place).exclusive() as claim:
-            assert claim.abandoned == ()
-            claim.announce("height")
-            with (
-                pytest.raises(StorageError, match=rf"another build is writing here \(process {os.getpid()}\)"),
-                self.store(place).exclusive(),
-            ):
-                pass
-            assert self.store(place).keys("") == []
-        assert not place.exists()
-        with self.store(place).exclusive() as claim:
-            assert claim.abandoned == ()
-            self.store(place).write("a", b"x")
-        assert [path.name for path in place.iterdir()] == ["a"]
-
     def test_what_a_killed_build_announced_is_known_to_the_next(self, tmp_path: Path) -> None:
         program = f"""
 import os, signal
@@ -337,15 +152,61 @@ with DirectoryStore(Path({str(tmp_path)!r})).exclusive() as claim:
         assert subprocess.run([sys.executable, "-c", program], check=False, timeout=60).returncode == -signal.SIGKILL
         with self.store(tmp_path).exclusive() as claim:
             assert claim.abandoned == ("height.2", "height")
-        with self.store(tmp_path).exclusive() as claim:
-            assert claim.abandoned == ()
+            assert claim.predecessor is not None
+            assert claim.predecessor != ClaimNote.mine().left_by()
+            claim.announce()
+        assert self.left(tmp_path) == []
 
-    @pytest.mark.parametrize("content", ["", "1234", "clipmap build", "clipmap build\n12\n../../etc\n/\n", "\x00\xff" * 40])
-    def test_a_lock_file_of_someone_else_announces_nothing(self, content: str, tmp_path: Path) -> None:
-        """2026-11-22: any file called .lock made a build take a foreign folder for its own leftovers, and delete them."""
-        (tmp_path / ".clipmap-lock").write_text(content)
+    def test_folders_that_were_made_go_only_if_nothing_is_in_them(self, tmp_path: Path) -> None:
+        with self.store(tmp_path / "a/b/c").exclusive():
+            assert (tmp_path / "a/b/c").is_dir()
+        assert list(tmp_path.iterdir()) == []
+        with self.store(tmp_path / "a/b/c").exclusive() as claim:
+            claim.announce("height")
+        assert self.left(tmp_path / "a/b/c") == [".clipmap-lock"]
+        (tmp_path / "d").mkdir()
+        with self.store(tmp_path / "d/e").exclusive():
+            pass
+        assert list((tmp_path / "d").iterdir()) == []
+
+    def test_the_first_form_of_the_note_is_still_understood(self, tmp_path: Path) -> None:
+        (tmp_path / ".clipmap-lock").write_text("clipmap build\n999999\nimagery\nlight.2\n../height\n")
         with self.store(tmp_path).exclusive() as claim:
-            assert claim.abandoned == ()
+            assert claim.abandoned == ("imagery", "light.2")
+            assert claim.predecessor == "process 999999"
+
+    def test_a_build_on_another_machine_is_named_with_it(self, tmp_path: Path) -> None:
+        """On a network file system the kernels agree on the lock; the note says on which machine to look."""
+        with self.store(tmp_path).exclusive():
+            note = replace(ClaimNote.mine(), machine="b2", begun=utc_now() - timedelta(hours=3, minutes=12, seconds=20))
+            (tmp_path / ".clipmap-lock").write_bytes(note.dump())
+            said = r"on b2, for 3 h 12 min, since .* UTC\); wait until it has ended, or end it on b2: the lock goes with the process"
+            with pytest.raises(StorageError, match=said), self.store(tmp_path).exclusive(break_stale=True):
+                pass
+            note = replace(ClaimNote.mine(), begun=utc_now() + timedelta(hours=1))
+            (tmp_path / ".clipmap-lock").write_bytes(note.dump())
+            with pytest.raises(StorageError, match="which is still to come by the clock of this machine"), self.store(tmp_path).exclusive():
+                pass
+            with pytest.raises(StorageError, match="the lock of a folder ends with its process"), self.store(tmp_path).exclusive(True):
+                pass
+
+    def test_a_lock_of_another_user_is_named(self, tmp_path: Path) -> None:
+        (tmp_path / ".clipmap-lock").write_text("")
+        (tmp_path / ".clipmap-lock").chmod(0o444)
+        with (
+            unprivileged(tmp_path) as place,
+            pytest.raises(StorageError, match=r"\.clipmap-lock: cannot be written: Permission denied$"),
+            self.store(place).exclusive(),
+        ):
+            pass
+
+    def test_a_note_that_cannot_be_written_is_a_sentence(self, tmp_path: Path) -> None:
+        with self.store(tmp_path).exclusive() as claim:
+            claim.announce("height")
+            with file_size_limit(0), pytest.raises(StorageError, match=r"clipmap-lock: cannot be written: File too large"):
+                claim.announce("imagery")
+        with self.store(tmp_path).exclusive() as claim:
+            assert claim.abandoned == ("height",)
 
 
 @contextmanager

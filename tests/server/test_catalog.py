@@ -12,7 +12,7 @@ from schemas.address import BlockAddress
 from schemas.errors import InputError, NotFoundError, UsageError
 from schemas.manifest import Manifest
 from schemas.settings import ServerSettings
-from server import catalog as catalog_module
+from server import slots as slots_module
 from server.app import create_app
 from server.catalog import Catalog
 from tests.server.datasets import block_bytes, write_dataset
@@ -176,7 +176,7 @@ def test_an_unreadable_manifest_is_tried_again(
     with client_of(root) as client:
         rebuilt = write_dataset(root / "alps", seed=2)
         with monkeypatch.context() as patch:
-            patch.setattr(catalog_module, "open_dataset", fail)
+            patch.setattr(slots_module, "open_dataset", fail)
             for _ in range(3):
                 assert client.get("/alps/manifest.json").json()["version"] == alps.version
         assert caplog.text.count("Too many open files") == 1
@@ -242,7 +242,7 @@ def test_the_manifest_is_read_once_per_version(root: Path, alps: Manifest, monke
         time.sleep(0.05)  # long enough for every other thread to arrive meanwhile
         return open_dataset(path)
 
-    monkeypatch.setattr(catalog_module, "open_dataset", counted)
+    monkeypatch.setattr(slots_module, "open_dataset", counted)
     catalog = Catalog([root])
     with ThreadPoolExecutor(8) as pool:
         assert len({id(published) for published in pool.map(catalog.dataset, ["alps"] * 200)}) == 1

@@ -9,7 +9,7 @@ from schemas.blockindex import BlockIndex, BlockRecord
 from schemas.errors import InputError, NotFoundError
 from schemas.manifest import MANIFEST_NAME, Manifest, digest, parse_manifest
 from tiler.stores import Store
-from tiler.stores.directory import DirectoryStore
+from tiler.stores.locate import folder_of, is_remote, open_store
 
 
 @dataclass(frozen=True)
@@ -68,15 +68,17 @@ def read_manifest(store: Store) -> Manifest | None:
     return parse_manifest(data, f"{store.location}/{MANIFEST_NAME}")
 
 
-def open_dataset(path: Path) -> Dataset:
-    """Open the dataset in the directory ``path``.
+def open_dataset(location: str | Path) -> Dataset:
+    """Open the dataset at ``location``, a folder or a URL.
 
-    Raises NotFoundError if there is no manifest, InputError if it cannot be understood.
+    Raises NotFoundError if there is no manifest, InputError if it cannot be understood, and whatever ``open_store`` raises.
     """
-    store = DirectoryStore(path)
+    store = open_store(location)
     manifest = read_manifest(store)
-    if manifest is None:
-        if path.is_dir() and any(path.iterdir()):
-            raise NotFoundError(f"{path}: no {MANIFEST_NAME}: not a dataset, or its build has not finished")
-        raise NotFoundError(f"{path}: no dataset there (no {MANIFEST_NAME})")
-    return Dataset(store, manifest)
+    if manifest is not None:
+        return Dataset(store, manifest)
+    # Not asked of an object store: there it would be a long list.
+    folder = None if is_remote(location) else folder_of(location)
+    if folder is not None and folder.is_dir() and any(folder.iterdir()):
+        raise NotFoundError(f"{folder}: no {MANIFEST_NAME}: not a dataset, or its build has not finished")
+    raise NotFoundError(f"{store.location}: no dataset there (no {MANIFEST_NAME})")

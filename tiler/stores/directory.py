@@ -3,19 +3,18 @@
 import ctypes
 import fcntl
 import os
-import re
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 
 from schemas.errors import NotFoundError, StorageError
+from tiler.stores.claims import CLAIM_NAME, MAX_CLAIM_BYTES, ClaimNote
+from tiler.stores.keys import check_key
 
 _TEMPORARY = ".tmp-"
-_LOCK = ".clipmap-lock"
-_CLAIM = "clipmap build"
-_PREFIX = re.compile(r"[a-z][a-z0-9_.]*")
 _LIBC = ctypes.CDLL(None, use_errno=True)
 
 
@@ -35,11 +34,13 @@ class DirectoryStore:
         """The directory's path."""
         return str(self._root)
 
+    @property
+    def scratch(self) -> Path:
+        """The directory itself."""
+        return self._root
+
     def _path(self, key: str) -> Path:
-        parts = key.split("/")
-        if "\0" in key or any(not part or part.startswith(".") for part in parts):
-            raise NotFoundError(f"{self._root}: {key!r} is not a key of a store")
-        return self._root.joinpath(*parts)
+        return self._root.joinpath(*check_key(self.location, key))
 
     def read(self, key: str) -> bytes:
         """Return the bytes under ``key``; raises NotFoundError or StorageError."""
@@ -76,6 +77,17 @@ class DirectoryStore:
             folder.mkdir(parents=True, exist_ok=True)
             self._known_folders.add(folder)
 
+    def delete(self, keys: Iterable[str]) -> None:
+        """Delete the files under ``keys``; raises StorageError."""
+        for key in keys:
+            path = self._path(key)
+            try:
+                path.unlink()
+            except (FileNotFoundError, NotADirectoryError):
+                continue
+            except OSError as error:
+                raise StorageError(f"{path}: cannot be deleted: {error.strerror}") from error
+
     def delete_prefix(self, prefix: str) -> None:
         """Delete every key below ``prefix``; raises StorageError."""
         path = self._path(prefix)
@@ -109,66 +121,112 @@ class DirectoryStore:
             os.close(descriptor)
 
     @contextmanager
-    def exclusive(self) -> Iterator["BuildClaim"]:
+    def exclusive(self, break_stale: bool = False) -> Iterator["BuildClaim"]:
         """Keep other builds out of the store as long as the block lasts.
 
-        The lock is the kernel's (``flock``), so it ends with the process however that ends. Makes the directory if there is
-        none, and removes it again if nothing was put in. Raises StorageError if another build is at work or the directory cannot
-        be made.
+        The lock is the kernel's (``flock``), so it ends with the process however that ends, and there is never one to break. Its
+        file stays, unlocked, while prefixes are announced. Makes the directory if there is none, and removes it again if
+        nothing was put in. Raises StorageError if another build is at work or the directory cannot be made.
         """
-        path = self._root / _LOCK
+        path = self._root / CLAIM_NAME
         try:
             made = [folder for folder in (self._root, *self._root.parents) if not folder.exists()]
             self._root.mkdir(parents=True, exist_ok=True)
-            descriptor = self._locked(path)
+            descriptor = self._locked(path, break_stale)
         except (FileExistsError, NotADirectoryError):
             raise StorageError(f"{self._root}: a file is in the way, or a link that leads nowhere; choose another folder") from None
         except OSError as error:
-            raise StorageError(f"{self._root}: cannot be written: {error.strerror}") from error
+            # A lock that another user's build left may be theirs alone, in a folder that is everybody's.
+            where = path if os.path.lexists(path) else self._root
+            raise StorageError(f"{where}: cannot be written: {error.strerror}") from error
+        claim = BuildClaim(descriptor, path)
         try:
-            yield BuildClaim(descriptor)
+            claim.announce(*claim.abandoned)
+            for prefix in claim.abandoned:
+                self._delete_temporaries(prefix)
+            yield claim
         finally:
-            path.unlink(missing_ok=True)
+            if not claim.announced:
+                path.unlink(missing_ok=True)
             os.close(descriptor)
             with suppress(OSError):
                 for folder in made:
                     folder.rmdir()
 
-    def _locked(self, path: Path) -> int:
+    def _delete_temporaries(self, prefix: str) -> None:
+        """Delete the half-written files that a killed build left below ``prefix``; nobody else can be writing there."""
+        for parent, _, names in os.walk(self._path(prefix)):
+            for name in names:
+                if name.startswith(_TEMPORARY):
+                    Path(parent, name).unlink(missing_ok=True)
+
+    def _locked(self, path: Path, break_stale: bool) -> int:
         while True:
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                _, owner = _read_claim(descriptor)
+                note = _read_note(descriptor)
                 os.close(descriptor)
-                raise StorageError(f"{self._root}: another build is writing here (process {owner}); wait until it has ended") from None
+                raise StorageError(_at_work(self.location, note, break_stale)) from None
             if path.exists() and os.path.samestat(os.fstat(descriptor), path.stat()):
                 return descriptor
             os.close(descriptor)  # its owner removed the file between our opening and locking it
 
 
 class BuildClaim:
-    """A build's hold on a store. Its file says who holds it and which prefixes are being written or deleted.
+    """A build's hold on a directory. Its file says who holds it and which prefixes are being written or deleted.
 
-    So the build after a killed one knows exactly what was left behind, and deletes that and nothing else.
+    So the build after one that was killed or failed knows exactly what was left behind: what it may go on with, or delete.
     """
 
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor = descriptor
-        self.abandoned, _ = _read_claim(descriptor)
-        self.announce(*self.abandoned)
+    def __init__(self, descriptor: int, path: Path) -> None:
+        self._descriptor, self._path = descriptor, path
+        left = _read_note(descriptor)
+        self.abandoned = () if left is None else left.prefixes
+        self.predecessor = left.left_by() if left is not None and left.prefixes else None
+        self._note = replace(ClaimNote.mine(), prefixes=self.abandoned)
+
+    @property
+    def announced(self) -> tuple[str, ...]:
+        """The prefixes announced last."""
+        return self._note.prefixes
 
     def announce(self, *prefixes: str) -> None:
-        """Write down the prefixes that are no dataset's until the build has ended."""
-        text = "\n".join([_CLAIM, str(os.getpid()), *prefixes]) + "\n"
-        os.ftruncate(self._descriptor, 0)
-        os.pwrite(self._descriptor, text.encode(), 0)
+        """Write down the prefixes that are no dataset's until the build has ended; raises StorageError."""
+        note = replace(self._note, prefixes=prefixes)
+        text = note.dump()
+        try:
+            # Over the old note, then cut off: a build that is killed in between leaves the new one whole, which is its first line.
+            written = os.pwrite(self._descriptor, text, 0)
+            os.ftruncate(self._descriptor, written)
+            # Or a power cut could leave blocks that nobody remembers.
+            os.fsync(self._descriptor)
+        except OSError as error:
+            raise StorageError(f"{self._path}: cannot be written: {error.strerror}") from error
+        if written < len(text):
+            raise StorageError(f"{self._path}: cannot be written: only {written} of {len(text)} bytes could be")
+        self._note = note
+
+    def confirm(self) -> None:
+        """Do nothing: nobody but the kernel can end the hold, and only with the process."""
 
 
-def _read_claim(descriptor: int) -> tuple[tuple[str, ...], str]:
-    """Return the prefixes and the process of a claim; none and 'unknown' if the file is not one."""
-    lines = os.pread(descriptor, 65536, 0).decode("utf-8", "replace").splitlines()
-    if len(lines) < 2 or lines[0] != _CLAIM:
-        return (), "unknown"
-    return tuple(line for line in lines[2:] if _PREFIX.fullmatch(line)), lines[1]
+def _at_work(location: str, note: ClaimNote | None, break_stale: bool) -> str:
+    """Return the sentence for a build that comes second."""
+    if note is None:
+        return f"{location}: another build is writing here; wait until it has ended"
+    sentence = f"{location}: another build is writing here ({note.at_work()}); "
+    if note.elsewhere:
+        return (
+            f"{sentence}wait until it has ended, or end it on {note.machine}: the lock goes with the process, or when the file server "
+            f"gives {note.machine} up"
+        )
+    if break_stale:
+        return f"{sentence}the lock of a folder ends with its process, so it is at work: wait until it has ended, or end it"
+    return f"{sentence}wait until it has ended"
+
+
+def _read_note(descriptor: int) -> ClaimNote | None:
+    """Return the note in a claim's file, None if it is not one."""
+    return ClaimNote.parse(os.pread(descriptor, MAX_CLAIM_BYTES, 0))

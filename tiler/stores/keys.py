@@ -1,0 +1,19 @@
+"""What a key is, the same for every store."""
+
+from schemas.errors import NotFoundError
+
+
+def check_key(location: str, key: str) -> list[str]:
+    """Return the parts of ``key``; raises NotFoundError if it is no plain relative path of visible names.
+
+    So no key leads out of a store, none means two things, and what is hidden (``.x``: locks, unfinished files) is out of reach.
+    """
+    parts = key.split("/")
+    if "\0" in key or any(not part or part.startswith(".") for part in parts):
+        raise NotFoundError(f"{location}: {key!r} is not a key of a store")
+    return parts
+
+
+def is_key(key: str) -> bool:
+    """Whether a listed name is a key: no part of it is hidden or empty."""
+    return all(part and not part.startswith(".") for part in key.split("/"))
