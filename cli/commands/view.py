@@ -88,10 +88,10 @@ def command(dataset: str, **given: Any) -> None:  # noqa: ANN401 - click passes 
     view_options = _options(given)
     _require_moderngl()
     paths = _picture_paths(dataset, given)
+    from cli.stored_source import open_block_source
     from viewer.scene import open_scene
-    from viewer.source import open_source
 
-    source = open_source(dataset, view_options.workers)
+    source = open_block_source(dataset, view_options.workers)
     try:
         scene = open_scene(source, view_options)
         try:
