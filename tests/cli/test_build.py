@@ -41,7 +41,7 @@ def test_report(sources: Sources, tmp_path: Path, clipmap: Clipmap) -> None:
     ran = clipmap("build", sources.dem, "-o", tmp_path / "out", "--block", "64", "--codec", "raw")
     assert (ran.code, ran.err) == (0, "")
     lines = dict(re.split(r"  +", line, maxsplit=1) for line in ran.out.splitlines())
-    assert lines["layer"] == f"height in {tmp_path / 'out'}"
+    assert lines["layer"] == f"height in {tmp_path / 'out'}, built"
     assert lines["samples"] == "200 x 150, 3 levels"
     assert lines["blocks"] == "16 stored, 1 blank, raw"
     assert lines["stored"] == "261.0 KiB"
@@ -181,7 +181,7 @@ FAILURES: list[tuple[str, list[str], int, str]] = [
     ("colour", ["--workers", "0"], 2, "--workers"),
     ("colour", ["--filter", "sharp"], 2, "'sharp'"),
     ("colour", ["--depth", "3"], 2, "--depth"),
-    ("colour", ["more.tif"], 2, "unexpected extra argument"),
+    ("colour", ["more.tif"], 2, "2 sources: add --mosaic to put them on one lattice"),
 ]
 
 
@@ -263,7 +263,7 @@ def test_output_that_is_no_dataset(sources: Sources, tmp_path: Path, clipmap: Cl
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["build"], "Missing argument 'SOURCE'. (see clipmap build --help)"),
+        (["build"], "Missing argument 'SOURCE...'. (see clipmap build --help)"),
         (["build", "x.tif"], "Missing option '-o' / '--output'"),
         (["nonsense"], "No such command 'nonsense'"),
         (["--nonsense"], "--nonsense"),
