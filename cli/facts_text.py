@@ -45,6 +45,7 @@ def show_layer(facts: LayerFacts) -> None:
     pairs[7:7] = _ground(facts.footprint)
     pairs += [("filled", f"voids up to {facts.fill} samples across")] if facts.fill else []
     pairs += [("enhanced", facts.enhance)] if facts.enhance else []
+    pairs += [("updates", f"{facts.patches}, with blocks under paths of their own")] if facts.patches else []
     pairs += [("source", source_text(facts.source))]
     emit_pairs(pairs)
     rows = [

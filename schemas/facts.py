@@ -45,6 +45,7 @@ class LayerFacts(Model):
     kind: LayerKind
     width: int = Field(description="Columns of level 0 [samples]")
     height: int = Field(description="Rows of level 0 [samples]")
+    patches: int = Field(description="Updates whose blocks lie under paths of their own")
     registration: str
     channels: int
     alpha: bool

@@ -36,6 +36,7 @@ def describe_layer(dataset: Dataset, name: str) -> LayerFacts:
         kind=layer.kind,
         width=layer.width,
         height=layer.height,
+        patches=len(layer.patches),
         registration=layer.registration,
         channels=layer.channels,
         alpha=layer.alpha,

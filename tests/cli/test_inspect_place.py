@@ -33,7 +33,7 @@ def test_json_is_valid_under_the_published_schema(name: str, survey: Path, clipm
 
 def test_no_field_of_the_manifest_is_left_out() -> None:
     """But for where the blocks lie; the unit has another name there, because a dataset has one as well."""
-    elsewhere = {"path", "patches", "suffix", "media_type", "unit"}
+    elsewhere = {"path", "suffix", "media_type", "unit"}
     assert set(Layer.model_fields) - elsewhere <= set(LayerFacts.model_fields)
     assert set(Level.model_fields) - {"availability", "index"} <= set(LevelSummary.model_fields)
 
