@@ -1,5 +1,6 @@
 """Whether source files have changed, as far as the file system knows: size and time of change, to the nanosecond."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
@@ -9,15 +10,16 @@ from schemas.region import Rect
 from tiler.sources import FileInfo
 
 _SIDECARS: Final = (".msk", ".aux.xml")
-"""Files that GDAL reads beside the one that is named: a mask, and nodata or georeference."""
+"""Files that GDAL reads beside one of a mosaic: a mask, and nodata or georeference."""
 _MARGIN: Final = 512
 """What fills voids or enhances details looks beyond the window it is asked for [px]; more than any of them."""
 
 
-def stamp_file(path: Path) -> str:
-    """Return the state of a source file and its sidecars; raises InputError if the file is gone."""
+def stamp_file(path: Path, others: Iterable[Path] = ()) -> str:
+    """Return the state of a source file, its sidecars and the ``others`` that it needs; raises InputError if the file is gone."""
     found = []
-    for each in (path, *(path.with_name(path.name + suffix) for suffix in _SIDECARS)):
+    sidecars = {path.with_name(path.name + suffix) for suffix in _SIDECARS}
+    for each in (path, *sorted(sidecars | set(others))):
         try:
             state = each.stat()
         except OSError as error:
@@ -33,10 +35,11 @@ class SourceStamps:
 
     def __init__(self, info: FileInfo) -> None:
         self._parts = [(part.path, part.window) for part in info.parts] or [(info.path, info.rect)]
+        self._others = info.files
         self.stamps = self._taken()
 
     def _taken(self) -> list[str]:
-        known = {path: stamp_file(path) for path in {path for path, _ in self._parts}}
+        known = {path: stamp_file(path, self._others) for path in {path for path, _ in self._parts}}
         return [known[path] for path, _ in self._parts]
 
     @property

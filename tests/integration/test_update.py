@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio.shutil
 from hypothesis import HealthCheck, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
@@ -91,6 +92,19 @@ def test_an_unchanged_source_is_up_to_date(tmp_path: Path) -> None:
     assert (again.outcome, again.manifest, again.tasks_kept) == ("up to date", first.manifest, again.tasks)
     assert build_layer(source, tmp_path / "out", settings(codec="png")).outcome == "up to date"
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["imagery", "manifest.json"]
+
+
+def test_a_change_behind_a_vrt_is_seen(tmp_path: Path) -> None:
+    """The file that is named stays as it is; the one it refers to changes."""
+    pixels = photo(300, 300)
+    source = write_tiff(tmp_path / "photo.tif", pixels)
+    rasterio.shutil.copy(source, tmp_path / "photo.vrt", driver="VRT")
+    build_layer(tmp_path / "photo.vrt", tmp_path / "out", settings(codec="png"))
+    pixels[:9, :9] ^= 0xFF
+    write_tiff(source, pixels)
+    with pytest.raises(UsageError, match="the source has changed since; add --update"):
+        build_layer(tmp_path / "photo.vrt", tmp_path / "out", settings(codec="png"))
+    assert build_layer(tmp_path / "photo.vrt", tmp_path / "out", settings(codec="png", update=True)).outcome == "updated"
 
 
 def test_an_update_of_nothing_is_a_build(tmp_path: Path) -> None:

@@ -65,6 +65,8 @@ class FileInfo:
     """How stored rows and columns lie in the picture, 1 to 8 as EXIF and TIFF count; 1 is upright."""
     least_bytes: int = 0
     """What the samples take if they are not compressed, 0 if unknown; a smaller file is cut off [bytes]."""
+    files: tuple[Path, ...] = ()
+    """What else the pixels come from, as GDAL lists it: the files a VRT refers to, a mask, a header or a world file beside the pixels."""
     parts: tuple[Part, ...] = ()
     """The files of a mosaic, lowest first; one that shows on both sides of the antimeridian appears twice. Empty for one file."""
 

@@ -107,6 +107,7 @@ def _located(picture: FileInfo, geographic: FileInfo) -> FileInfo:
     Channels that differ in number are a palette, which OpenImageIO resolves: then GDAL's nodata value is an index, not a colour.
     """
     georeference = geographic.georeference
+    picture = replace(picture, files=geographic.files)
     if geographic.channels != picture.channels:
         return replace(picture, has_mask=geographic.has_mask, georeference=georeference)
     alpha = geographic.alpha if picture.alpha is None else picture.alpha

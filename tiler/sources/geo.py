@@ -75,6 +75,7 @@ def _info(path: Path, dataset: Any) -> FileInfo | None:  # noqa: ANN401
         has_mask=MaskFlags.per_dataset in flags and MaskFlags.alpha not in flags,
         compression=structure.get("COMPRESSION"),
         georeference=_georeference(dataset),
+        files=tuple(file for file in map(Path, dataset.files) if file != path and file.is_file()),
         bits=bits if dtype.kind == "u" and bits < 8 * dtype.itemsize else None,
         least_bytes=dataset.width * dataset.height * dataset.count * bits // 8 if _is_plain(path, dataset, structure) else 0,
     )
