@@ -17,6 +17,7 @@ from tiler.cascade import Coverage, Values
 from tiler.codecs import BlockFormat, Codec, Mask, Samples
 from tiler.destination import Destination
 from tiler.measure import measure
+from tiler.overlap import TaskWrites
 from tiler.stores import Store
 from tiler.transfer import encode_srgb
 
@@ -117,7 +118,8 @@ class Cutter:
     """Takes the rows a cascade emits for one task and stores the blocks of its levels.
 
     ``core`` are the task's samples of level ``first_level``; rows and columns beyond it and its pad (the halo) are dropped.
-    ``on_block`` is called once per finished block; ``written`` counts those whose bytes were stored.
+    ``on_block`` is called once per finished block; ``written`` counts those whose bytes were stored. After the
+    last rows ``finish`` must be called: until then blocks may be on their way.
     """
 
     def __init__(self, target: Target, first_level: int, core: Rect, on_block: Callable[[CutBlock], None]) -> None:
@@ -128,6 +130,13 @@ class Cutter:
         self._core = core
         self._on_block = on_block
         self._strips: dict[int, _Strip] = {}
+        self._writes = TaskWrites(target.store)
+
+    def finish(self) -> None:
+        """Return when all blocks are stored; raises StorageError if one could not be."""
+        started = perf_counter()
+        self._writes.finish()
+        self.times.write_s += perf_counter() - started
 
     def take(self, level: int, first: int, values: Values, coverage: Coverage | None, left: int) -> None:
         """Take rows ``first`` and following of ``level``, whose first column is ``left``."""
@@ -179,7 +188,7 @@ class Cutter:
         record = BlockRecord(digest(data), len(data), count, low, high)
         key = target.destination.key(address, record)
         if key is not None:
-            target.store.write(key, data)
+            self._writes.write(key, data)
             self.written += 1
         self.times.encode_s += encoded - started
         self.times.write_s += perf_counter() - encoded

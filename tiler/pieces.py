@@ -46,9 +46,11 @@ class PieceWriter:
 
 
 class PieceReader:
-    """Windows of a level that ``pieces`` cover, for one task, top to bottom; ``load`` returns the bytes of a piece."""
+    """Windows of a level that ``pieces`` cover, for one task, top to bottom; ``load`` returns the bytes of pieces."""
 
-    def __init__(self, pieces: Sequence[PieceRef], load: Callable[[PieceRef], bytes], channels: int, masked: bool) -> None:
+    def __init__(
+        self, pieces: Sequence[PieceRef], load: Callable[[Sequence[PieceRef]], Sequence[bytes]], channels: int, masked: bool
+    ) -> None:
         self._pieces, self._load = pieces, load
         self._channels, self._masked = channels, masked
         self._held: dict[Rect, Pixels] = {}
@@ -57,13 +59,14 @@ class PieceReader:
         """Return values (rows, columns, channels) and coverage of a window; pieces that end above it are forgotten."""
         pixels = np.empty((window.height, window.width, self._channels + self._masked), np.float32)
         self._held = {rect: held for rect, held in self._held.items() if rect.y1 > window.y0}
-        for piece in self._pieces:
+        seen = [piece for piece in self._pieces if piece.task.piece & window]
+        missing = [piece for piece in seen if piece.task.piece not in self._held]
+        for piece, data in zip(missing, self._load(missing), strict=True):
+            rect = piece.task.piece
+            self._held[rect] = np.frombuffer(data, "<f4").reshape(rect.height, rect.width, pixels.shape[2])
+        for piece in seen:
             rect = piece.task.piece
             part = rect & window
-            if not part.area:
-                continue
-            if rect not in self._held:
-                self._held[rect] = np.frombuffer(self._load(piece), "<f4").reshape(rect.height, rect.width, pixels.shape[2])
             source = self._held[rect][part.y0 - rect.y0 : part.y1 - rect.y0, part.x0 - rect.x0 : part.x1 - rect.x0]
             pixels[part.y0 - window.y0 : part.y1 - window.y0, part.x0 - window.x0 : part.x1 - window.x0] = source
         if not self._masked:
