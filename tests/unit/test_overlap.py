@@ -64,14 +64,14 @@ def test_an_error_is_raised_and_nothing_is_left_under_way(location: str, tmp_pat
     writes = TaskWrites(store)
 
     def work() -> None:
-        for key in ("a", "bad", "b", "c"):
-            writes.write(key, b"x")
-
-    with pytest.raises(StorageError, match="bad: refused"):
         try:
-            work()
+            for key in ("a", "bad", "b", "c"):
+                writes.write(key, b"x")
         finally:
             writes.finish()
+
+    with pytest.raises(StorageError, match="bad: refused"):
+        work()
     assert store.under_way == 0
 
 
