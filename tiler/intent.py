@@ -91,15 +91,14 @@ def _beside(store: Store, layer: Layer, plan: Plan, stamps: SourceStamps, settin
         raise UsageError(f"{has}, and no records of how it was built; add --overwrite to replace it, or choose another folder")
     if difference := record.explain(plan.signature):
         raise _other_settings(store, plan.name, difference)
-    path = left[-1] if left else _unused_path(store, plan.name, max(map(_number, layer.paths)))
-    same_source = record.stamps == stamps.stamps and record.place == plan.place
-    if same_source and not left:
-        return Intent("nothing", layer.path, layer.path, record)
+    if record.stamps == stamps.stamps and record.place == plan.place:
+        return Intent("nothing", layer.path, layer.path, record, tuple(left))
     if not settings.update:
         raise UsageError(
             f"{has}, and the source has changed since; add --update to rebuild what changed, --overwrite to rebuild all, "
             "or choose another folder"
         )
+    path = left[-1] if left else _unused_path(store, plan.name, _last_number(layer))
     return Intent("update", path, layer.path, record, tuple(left[:-1]))
 
 

@@ -94,6 +94,33 @@ def test_an_unchanged_source_is_up_to_date(tmp_path: Path) -> None:
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["imagery", "manifest.json"]
 
 
+def test_an_update_that_was_given_up_is_cleared(tmp_path: Path) -> None:
+    """The source changes, the update fails half-way, the source is put back: the dataset is up to date, and nothing else is left."""
+    pixels = photo(300, 300)
+    source, out = write_tiff(tmp_path / "photo.tif", pixels), tmp_path / "out"
+    options = {"codec": "png", "task": 64}
+    first = build_layer(source, out, settings(**options))
+    state = source.stat()
+    write_tiff(source, pixels ^ 0xFF)
+
+    def fail(done: int, total: int) -> None:
+        if done == total // 2:
+            raise InputError("the source became unreadable")
+
+    with pytest.raises(InputError) as failure:
+        build_layer(source, out, settings(update=True, **options), fail)
+    assert "tasks are finished and kept" in failure.value.__notes__[0]
+    assert (out / "imagery.2").exists()
+    write_tiff(source, pixels)
+    os.utime(source, ns=(state.st_atime_ns, state.st_mtime_ns))
+    again = build_layer(source, out, settings(**options))
+    assert (again.outcome, again.manifest) == ("up to date", first.manifest)
+    assert sorted(path.name for path in out.iterdir()) == ["imagery", "manifest.json"]
+    assert verify(open_dataset(out)).findings == []
+    os.utime(source)
+    assert build_layer(source, out, settings(update=True, **options)).manifest == first.manifest
+
+
 def test_a_change_behind_a_vrt_is_seen(tmp_path: Path) -> None:
     """The file that is named stays as it is; the one it refers to changes."""
     pixels = photo(300, 300)
