@@ -55,7 +55,7 @@ class LazyGroup(click.Group):
 def cli() -> None:
     """Turn huge satellite images and elevation models into clipmap-ready datasets, and stream them to viewers.
 
-    Exit status: 0 done, 1 a check found something wrong, 2 usage, 3 bad input, 4 reading or writing failed.
+    Exit status: 0 done, 1 a check found something wrong or a job of a batch failed, 2 usage, 3 bad input, 4 reading or writing failed.
     """
 
 
@@ -95,7 +95,7 @@ def _ended(error: BaseException) -> int:
             click.echo("clipmap: interrupted", err=True)
             code = INTERRUPTED
     # What is kept, and how to go on. Of an interrupt, click raises another error in its place.
-    for note in getattr(error, "__notes__", None) or getattr(error.__context__, "__notes__", ()):
+    for note in getattr(error, "__notes__", []) or getattr(error.__context__, "__notes__", []):
         click.echo(f"note: {note}", err=True)
     return code
 

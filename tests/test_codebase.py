@@ -19,7 +19,19 @@ MAX_LINES = 400
 LONGER: dict[str, str] = {}
 """Files that may be longer, and why."""
 VAGUE_NAMES = {"utils", "util", "helpers", "helper", "manager", "managers", "common", "misc"}
-HEAVY = {"numba", "obstore", "numpy", "OpenImageIO", "OpenEXR", "rasterio", "imagecodecs", "fastapi", "uvicorn", "pydantic_settings", "moderngl"}
+HEAVY = {
+    "numba",
+    "obstore",
+    "numpy",
+    "OpenImageIO",
+    "OpenEXR",
+    "rasterio",
+    "imagecodecs",
+    "fastapi",
+    "uvicorn",
+    "pydantic_settings",
+    "moderngl",
+}
 BUILT = {".venv", ".git", "__pycache__", ".mypy_cache", ".ruff_cache", ".pytest_cache", ".hypothesis", ".import_linter_cache"}
 
 

@@ -80,7 +80,9 @@ def check_index(dataset: Dataset, name: str, number: int) -> tuple[BlockIndex | 
     if digest(data) != level.index:
         return None, [wrong("index", f"differs from the digest in the manifest; {skipped}")]
     index = BlockIndex(data, blocks, layer.index_key(number))
-    return index, [finding(kind, dataset, name, what, REBUILD, level=number, file="manifest.json") for kind, what in _against_manifest(level, index)]
+    return index, [
+        finding(kind, dataset, name, what, REBUILD, level=number, file="manifest.json") for kind, what in _against_manifest(level, index)
+    ]
 
 
 def _against_manifest(level: Level, index: BlockIndex) -> list[tuple[FindingKind, str]]:

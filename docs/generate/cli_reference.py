@@ -21,7 +21,7 @@ HEAD: Final = f"""# Command line
 | exit status | meaning |
 |---|---|
 | 0 | done |
-| 1 | a check found something wrong |
+| 1 | a check found something wrong, or a job of a batch failed |
 | 2 | usage: unknown option, contradiction, an optional dependency that is not installed |
 | 3 | bad input: a source or dataset that is missing, damaged or not supported |
 | 4 | reading from or writing to a store failed |

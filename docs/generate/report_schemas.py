@@ -1,4 +1,4 @@
-"""Write ``docs/reports.schema.json``, the JSON Schemas of what ``inspect``, ``verify`` and ``diff`` print with ``--json``."""
+"""Write ``docs/reports.schema.json``, the JSON Schemas of what ``inspect``, ``verify``, ``diff`` and others print with ``--json``."""
 
 import json
 from pathlib import Path
@@ -6,13 +6,25 @@ from typing import Any, Final
 
 from pydantic.json_schema import models_json_schema
 
+from schemas.batch import BatchReport
+from schemas.estimates import BuildEstimate
 from schemas.facts import BlockFacts, DatasetFacts, LayerFacts, LevelFacts, PointFacts
 from schemas.findings import DiffReport, VerifyReport
 from schemas.manifest import Model
 
 TARGET = Path(__file__).parents[1] / "reports.schema.json"
 
-REPORTS: Final[tuple[type[Model], ...]] = (DatasetFacts, LayerFacts, LevelFacts, BlockFacts, PointFacts, VerifyReport, DiffReport)
+REPORTS: Final[tuple[type[Model], ...]] = (
+    DatasetFacts,
+    LayerFacts,
+    LevelFacts,
+    BlockFacts,
+    PointFacts,
+    VerifyReport,
+    DiffReport,
+    BuildEstimate,
+    BatchReport,
+)
 
 
 def schema() -> dict[str, Any]:
@@ -20,8 +32,9 @@ def schema() -> dict[str, Any]:
     _, definitions = models_json_schema([(model, "serialization") for model in REPORTS], title="clipmap reports")
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "$comment": f"Generated from schemas/facts.py and schemas/findings.py by docs/generate/{Path(__file__).name}. "
-        "inspect prints DatasetFacts, LayerFacts, LevelFacts, BlockFacts or PointFacts, verify VerifyReport, diff DiffReport.",
+        "$comment": f"Generated from facts.py, findings.py, estimates.py and batch.py of schemas/ by docs/generate/{Path(__file__).name}. "
+        "inspect prints DatasetFacts, LayerFacts, LevelFacts, BlockFacts or PointFacts, verify VerifyReport, diff DiffReport, "
+        "build --plan BuildEstimate, batch BatchReport.",
         "anyOf": [{"$ref": f"#/$defs/{model.__name__}"} for model in REPORTS],
         **definitions,
     }

@@ -95,7 +95,8 @@ def test_kills_of_an_update(seed: int, tmp_path: Path) -> None:
         write_tiff(source, pixels)
         os.utime(source, (turn, turn))
         assert crash(source, out, 4, 10 * seed + turn, finish=False, most_writes=60, update=True) > 0
-        assert verify(open_dataset(out)).findings == [], "the old version or the new one"
+        findings = verify(open_dataset(out)).findings
+        assert {found.kind for found in findings} <= {"stray"}, "the old version or the new one, and what was not yet deleted"
         crash(source, out, 0, seed, finish=True, most_writes=2, update=True)
         assert verify(open_dataset(out)).findings == []
     build_layer(source, tmp_path / "full", settings(**OPTIONS))

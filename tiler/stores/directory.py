@@ -143,7 +143,7 @@ class DirectoryStore:
         try:
             claim.announce(*claim.abandoned)
             for prefix in claim.abandoned:
-                self._delete_temporaries(prefix)
+                self.delete_temporaries(prefix)
             yield claim
         finally:
             if not claim.announced:
@@ -153,8 +153,8 @@ class DirectoryStore:
                 for folder in made:
                     folder.rmdir()
 
-    def _delete_temporaries(self, prefix: str) -> None:
-        """Delete the half-written files that a killed build left below ``prefix``; nobody else can be writing there."""
+    def delete_temporaries(self, prefix: str) -> None:
+        """Delete the half-written files that killed processes left below ``prefix``; nobody may be writing there."""
         for parent, _, names in os.walk(self._path(prefix)):
             for name in names:
                 if name.startswith(_TEMPORARY):
