@@ -4,6 +4,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+import click
+
 from schemas.errors import UsageError
 
 if TYPE_CHECKING:
@@ -22,5 +24,5 @@ def open_engine(name: str, scheduler: str | None) -> Iterator["Engine | None"]:
         raise UsageError("--engine dask needs the address of the scheduler, e.g. --scheduler tcp://head:8786")
     from tiler.cluster import DaskEngine
 
-    with DaskEngine(scheduler) as engine:
+    with DaskEngine(scheduler, lambda sentence: click.echo(f"note: {sentence}", err=True)) as engine:
         yield engine

@@ -7,7 +7,7 @@ import os
 import resource
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -16,10 +16,10 @@ from typing import Literal
 from schemas.errors import ClipmapError, UsageError
 from schemas.manifest import Layer, Manifest
 from schemas.settings import BuildSettings
-from tiler.cut import StageTimes, Target
-from tiler.destination import ChangedBlocks, Destination, NewBlocks
+from tiler.cut import StageTimes
 from tiler.engine import Engine, LocalEngine
 from tiler.intent import can_be_continued, decide, find_ranges_known, layer_of
+from tiler.job import Job, make_target
 from tiler.ledger import Ledger
 from tiler.pieces import PieceRef
 from tiler.plan import Plan, plan_layer
@@ -91,7 +91,8 @@ def build_layer(
         samples = open_samples(sources, store.scratch, settings, workers, known_ranges)
         try:
             plan = plan_layer(samples, dataset, settings)
-            build = _Build(plan, store, claim, dataset, SourceStamps(samples.info), settings, engine or LocalEngine(plan.workers))
+            engine = engine or LocalEngine(plan.workers)
+            build = _Build(plan, sources, store, claim, dataset, SourceStamps(samples.info), settings, engine)
             build.run(on_progress)
         finally:
             samples.close()
@@ -119,8 +120,8 @@ def refuse_inside(path: Path, store: Store) -> None:
 
 
 def refuse_foreign(store: Store, claim: Claim) -> None:
-    """Refuse a place that holds something else than a dataset or an unfinished one."""
-    foreign = sorted({key.partition("/")[0] for key in store.keys("")} - set(claim.abandoned))
+    """Refuse a place that holds something else than a dataset or an unfinished one, of which there is no need to list the blocks."""
+    foreign = () if claim.abandoned else sorted({key.partition("/")[0] for key in store.keys("")})
     if foreign:
         raise UsageError(f"{store.location}: not a dataset, and not empty (it holds {foreign[0]}); choose another folder for -o")
 
@@ -131,6 +132,7 @@ class _Build:
     def __init__(
         self,
         plan: Plan,
+        sources: Sequence[Path],
         store: Store,
         claim: Claim,
         dataset: Manifest | None,
@@ -138,7 +140,7 @@ class _Build:
         settings: BuildSettings,
         engine: Engine,
     ) -> None:
-        self._store, self._claim, self._dataset = store, claim, dataset
+        self._sources, self._store, self._claim, self._dataset = sources, store, claim, dataset
         self._stamps, self._settings, self._engine = stamps, settings, engine
         self._layer = None if dataset is None else dataset.layers.get(plan.name)
         self._sweep(plan.name)
@@ -148,7 +150,7 @@ class _Build:
         self.plan = plan if record is None else replace(plan, partition=record.partition)
         self._book = RecordBook(store, self._intent.tasks_path)
         self._times = StageTimes()
-        self._kept = self._written = 0
+        self._noted = self._kept = self._written = 0
         self._changed = False
         self.manifest = dataset
 
@@ -189,7 +191,8 @@ class _Build:
             yield
         except BaseException as error:
             with suppress(ClipmapError):
-                finished = self._book.finished()
+                # Of an update every task has a record, that of the published layer if no newer one.
+                finished = self._book.finished() if self._intent.act == "build" else self._noted
                 if finished > 0:
                     error.add_note(f"{finished} of {self.plan.task_count} tasks are finished and kept: the same command goes on from there")
                 elif self._intent.act == "build" and self._intent.record is None:
@@ -204,18 +207,23 @@ class _Build:
         ledger = Ledger(plan.lattice, plan.source.conversion.channels)
         counter = _Counter(plan, on_progress)
         published = None if self._dataset is None else Dataset(self._store, self._dataset)
-        worker = TaskWorker(plan, self._target(published), self._book, self._stamps, counter.add)
+        target = make_target(plan, self._store, intent.path, published if intent.act == "update" else None)
+        worker = TaskWorker(plan, target, self._book, self._stamps, counter.add, self._job(record))
         pieces: dict[Task, str] = {}
         for tier in plan.tiers:
             handed_on: dict[Task, str] = {}
-            for done in self._engine.run(worker, self._works(worker, tier, pieces)):
-                self._note(done, ledger)
-                if done.record.piece is not None:
-                    handed_on[done.task] = done.record.piece
+            # Closed however the loop ends, so that no task is under way any more when what is kept is counted.
+            with closing(self._engine.run(worker, self._works(worker, tier, pieces))) as finished:
+                for done in finished:
+                    self._note(done, ledger)
+                    if done.record.piece is not None:
+                        handed_on[done.task] = done.record.piece
             pieces = handed_on
         self._stamps.require_unchanged()
         self._claim.confirm()
         if intent.act == "update" and published is not None:
+            # Killed after the manifest and before the last line, the next build must not take the dataset for that of the old source.
+            self._book.write_plan(record.model_copy(update={"stamps": []}))
             result = publish_update(plan, self._store, intent.path, ledger, published)
             self._book.write_plan(record)
             RecordBook(self._store, intent.path).delete()
@@ -228,18 +236,21 @@ class _Build:
 
     def _note(self, done: Done, ledger: Ledger) -> None:
         ledger.enter(done.task, done.record)
+        self._noted += 1
         self._times.add(done.times)
         self._kept += done.kept
         self._written += done.written
 
-    def _target(self, published: Dataset | None) -> Target:
-        plan, path = self.plan, self._intent.path
-        destination: Destination
-        if self._intent.act == "update" and published is not None:
-            destination = ChangedBlocks(self._store, path, published, plan.name)
-        else:
-            destination = NewBlocks(self._store, path, plan.name, plan.lattice.levels, plan.codec.suffix)
-        return Target(self._store, destination, plan.lattice, plan.block, plan.codec, plan.linear_light)
+    def _job(self, record: PlanRecord) -> Job:
+        intent = self._intent
+        return Job(
+            sources=[str(path.absolute()) for path in self._sources],
+            record=record,
+            path=intent.path,
+            tasks_path=intent.tasks_path,
+            update=intent.act == "update",
+            version=None if self._dataset is None else self._dataset.version,
+        )
 
     def _plan_record(self) -> PlanRecord:
         return PlanRecord(

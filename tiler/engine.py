@@ -1,6 +1,6 @@
 """Where tasks run: on threads of this machine (kernels, codecs and readers release the GIL), or wherever another engine takes them."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
@@ -11,7 +11,7 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 
-def run_tasks(work: Callable[[Task], Result], tasks: Iterable[Task], workers: int) -> Iterator[Result]:
+def run_tasks(work: Callable[[Task], Result], tasks: Iterable[Task], workers: int) -> Generator[Result]:
     """Yield the results of ``work`` on every task, as they come, with at most ``workers`` at a time.
 
     Tasks are taken from the iterable only when a worker is free. The first error ends the run once the tasks under way have
@@ -39,8 +39,8 @@ def run_tasks(work: Callable[[Task], Result], tasks: Iterable[Task], workers: in
 class Engine(Protocol):
     """Runs the tasks of a tier; the results do not depend on the engine."""
 
-    def run(self, worker: "TaskWorker", works: Iterable["Work"]) -> Iterator["Done"]:
-        """Yield what became of every task, as they end; raises the first error."""
+    def run(self, worker: "TaskWorker", works: Iterable["Work"]) -> Generator["Done"]:
+        """Yield what became of every task, as they end; raises the first error. Once it is closed no task is under way."""
         ...
 
 
@@ -50,6 +50,6 @@ class LocalEngine:
     def __init__(self, workers: int) -> None:
         self._workers = workers
 
-    def run(self, worker: "TaskWorker", works: Iterable["Work"]) -> Iterator["Done"]:
-        """Yield what became of every task, as they end; raises the first error."""
+    def run(self, worker: "TaskWorker", works: Iterable["Work"]) -> Generator["Done"]:
+        """Yield what became of every task, as they end; raises the first error. Once it is closed no task is under way."""
         return run_tasks(worker, works, self._workers)

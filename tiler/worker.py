@@ -1,20 +1,25 @@
 """Running one task: reads its window in portions, filters, cuts and stores its blocks, hands its piece on, writes its record."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from schemas.errors import InputError, NotFoundError
 from schemas.manifest import digest
 from schemas.region import Rect
 from tiler.cascade import Cascade, Coverage, Values, held_windows
 from tiler.cut import CutBlock, Cutter, StageTimes, Target
+from tiler.overlap import read_all
 from tiler.pieces import PieceReader, PieceRef, PieceWriter
 from tiler.plan import Plan
 from tiler.records import RecordBook, TaskRecord
 from tiler.stamps import SourceStamps
+from tiler.stores import Store
 from tiler.tasks import Task
+
+if TYPE_CHECKING:
+    from tiler.job import Job
 
 _PORTION_ROWS: Final = 256
 _PORTION_BYTES: Final = 8 << 20
@@ -55,10 +60,27 @@ class TaskWorker:
     """
 
     def __init__(
-        self, plan: Plan, target: Target, book: RecordBook, stamps: SourceStamps, on_block: Callable[[int], None] = lambda count: None
+        self,
+        plan: Plan,
+        target: Target,
+        book: RecordBook,
+        stamps: SourceStamps,
+        on_block: Callable[[int], None] = lambda count: None,
+        job: "Job | None" = None,
     ) -> None:
         self._plan, self._target, self._book, self._stamps = plan, target, book, stamps
         self._on_block = on_block
+        self.job = job
+        """What other processes need to know to run the same tasks; None if none may."""
+
+    @property
+    def store(self) -> Store:
+        """Where blocks and records go."""
+        return self._target.store
+
+    def count(self, done: Done) -> None:
+        """Count the blocks of a task that another process has run."""
+        self._on_block(len(done.record.index()))
 
     def __call__(self, work: Work) -> Done:
         """Run a task, or find that its record holds; raises InputError or StorageError."""
@@ -134,7 +156,11 @@ class TaskWorker:
                 piece.take(first, values, coverage, windows[step].x0)
 
         cascade = Cascade(plan.lattice.level_size(tier.first), windows, plan.source.conversion.channels, plan.recipe, sink)
-        content = self._push(work, cascade, windows[0], cutter.times)
+        try:
+            content = self._push(work, cascade, windows[0], cutter.times)
+        finally:
+            # Also when the task fails: nothing may be on its way any more when what is left is looked at, or deleted.
+            cutter.finish()
         stamp = self._stamp(work)
         handed_on = None if piece is None else piece.data()
         record = TaskRecord.of(
@@ -148,7 +174,9 @@ class TaskWorker:
     def _push(self, work: Work, cascade: Cascade, whole: Rect, times: StageTimes) -> str:
         """Push the task's window through the cascade; return the digest of what was read of the source, '' if nothing was."""
         plan, first = self._plan, work.task.tier.first
-        samples = plan.source if first == 0 else PieceReader(work.pieces, self._load, plan.source.conversion.channels, plan.recipe.masked)
+        samples = (
+            plan.source if first == 0 else PieceReader(work.pieces, self._load_all, plan.source.conversion.channels, plan.recipe.masked)
+        )
         plan.source.begin()
         started = perf_counter()
         for window in self._portions(work.task, whole):
@@ -160,6 +188,9 @@ class TaskWorker:
                 cascade.push(values[rows], None if coverage is None else coverage[rows])
         times.filter_s = perf_counter() - started - times.read_s - times.encode_s - times.write_s
         return "" if first else plan.source.digest()
+
+    def _load_all(self, pieces: Sequence[PieceRef]) -> list[bytes]:
+        return read_all(self._target.store, self._load, pieces)
 
     def _load(self, piece: PieceRef) -> bytes:
         """Return the bytes of a piece; a lost or damaged one is made again by the task that it came from."""

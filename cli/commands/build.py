@@ -105,6 +105,8 @@ def command(
     """
     settings = build_settings(options)
     if only_plan:
+        from cli.plan_text import show_plan
+
         show_plan(sources, output, settings, as_json)
         return
     with progress_bar("blocks") as on_progress, open_engine(engine, scheduler) as runner:

@@ -34,6 +34,10 @@ class Part:
 
     path: Path
     window: Rect
+    files: tuple[Path, ...] = ()
+    """What else its pixels come from, as with ``FileInfo.files``."""
+    how: str = ""
+    """What decides, besides its pixels, what it gives there: its own place and the grid it is resampled to; '' if it is copied."""
 
 
 @dataclass(frozen=True, slots=True)

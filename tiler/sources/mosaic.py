@@ -83,13 +83,18 @@ def _refuse_resampling(infos: Sequence[FileInfo], arrangement: Arrangement) -> N
             )
 
 
+def _part(info: FileInfo, place: Placement, arrangement: Arrangement, kernel: Kernel) -> Part:
+    how = "" if place.exact else f"{kernel} of {info.georeference} onto {arrangement.grid} after {place.turns} turns"
+    return Part(info.path, place.rect & Rect(0, 0, arrangement.width, arrangement.height), info.files, how)
+
+
 class MosaicReader:
     """Windows of all files of a mosaic, from any thread; only files that a window meets are opened."""
 
     def __init__(
         self, pool: ReaderPool, infos: Sequence[FileInfo], form: Form, arrangement: Arrangement, nodata: float | None, kernel: Kernel
     ) -> None:
-        self._pool, self._form = pool, form
+        self._pool, self._form, self._kernel = pool, form, kernel
         self._placements = arrangement.placements
         self._rects = np.array([[p.rect.x0, p.rect.y0, p.rect.x1, p.rect.y1] for p in self._placements], np.int64)
         self._layerers = [Layerer(info, form, nodata) for info in infos]
@@ -128,7 +133,7 @@ class MosaicReader:
             has_mask=not form.alpha and not complete,
             georeference=type(first.georeference)(first.georeference.crs, first.georeference.unit, arrangement.grid.transform),
             bits=form.bits,
-            parts=tuple(Part(infos[place.number].path, place.rect & whole) for place in self._placements),
+            parts=tuple(_part(infos[place.number], place, arrangement, self._kernel) for place in self._placements),
         )
 
     def read(self, window: Rect) -> tuple[Pixels, NDArray[np.uint8] | None]:
