@@ -24,6 +24,9 @@ MAX_LEVEL_BLOCKS = 1 << 31
 """So that a few bytes of a hostile manifest cannot make a reader allocate without bound."""
 
 PATH_PATTERN = r"^[a-z][a-z0-9_.]*$"
+MAX_PATCHES = 64
+MAX_PATCHED_BLOCKS = 1 << 33
+"""Of level 0, over all patches: their bitmaps, unpacked, take at most 1.4 GB."""
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
 Transform = tuple[float, float, float, float, float, float]
 SampleType = Literal["uint8", "uint16", "float32"]
@@ -181,20 +184,27 @@ class Layer(Model):
         """Return the prefix under which a block lies; raises InputError if a patch's bitmap is damaged."""
         if self.patches:
             number = self.lattice.block_number(address)
-            for patch, bitmaps in zip(reversed(self.patches), reversed(self._patched), strict=True):
-                if bitmaps[address.level][number // 8] >> number % 8 & 1:
-                    return patch.path
+            for patch in range(len(self.patches) - 1, -1, -1):
+                bitmap = self._patch_bitmap(patch, address.level)
+                if bitmap is None or bitmap[number // 8] >> number % 8 & 1:
+                    return self.patches[patch].path
         return self.path
 
+    def _patch_bitmap(self, patch: int, level: int) -> bytes | None:
+        """Return the bitmap of a level in a patch, unpacked once; None if it has all blocks."""
+        text = self.patches[patch].levels[level]
+        if text == "all":
+            return None
+        known = self._bitmaps.get((patch, level))
+        if known is None:
+            entry = self.levels[level]
+            known = unpack_bitmap(text, entry.columns * entry.rows, f"patch {self.patches[patch].path!r}")
+            self._bitmaps[patch, level] = known
+        return known
+
     @cached_property
-    def _patched(self) -> list[list[bytes]]:
-        return [
-            [
-                unpack_bitmap(text, level.columns * level.rows, f"patch {patch.path!r}")
-                for text, level in zip(patch.levels, self.levels, strict=True)
-            ]
-            for patch in self.patches
-        ]
+    def _bitmaps(self) -> dict[tuple[int, int], bytes]:
+        return {}
 
     def block_key(self, name: str, address: BlockAddress) -> str:
         """Return the store key of a block of this layer, which is called ``name`` in the manifest."""
@@ -226,6 +236,8 @@ class Layer(Model):
             raise ValueError("levels must be listed from 0, without gaps")
         if any(len(patch.levels) != lattice.levels for patch in self.patches):
             raise ValueError("a patch must have a bitmap per level")
+        if len(self.patches) > MAX_PATCHES or len(self.patches) * columns * rows > MAX_PATCHED_BLOCKS:
+            raise ValueError(f"{len(self.patches)} patches of a layer of {columns} x {rows} blocks are more than are supported")
         return self
 
 

@@ -9,7 +9,7 @@ from time import perf_counter
 from typing import Final
 
 from schemas.batch import BatchReport, JobReport
-from tiler.jobs import Build, Built, Check, Checked, Job, JobProcess, Request, explain_death
+from tiler.batchjobs import Build, Built, Check, Checked, Job, JobProcess, Request, explain_death
 from tiler.machine import PROCESS_BYTES
 from tiler.stores.locate import is_remote
 

@@ -5,26 +5,22 @@ Whatever a task has finished is kept until the layer is published, however a bui
 
 import os
 import resource
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Literal
 
-from schemas.errors import ClipmapError, UsageError
+from schemas.errors import UsageError
 from schemas.manifest import Layer, Manifest
 from schemas.settings import BuildSettings
 from tiler.cut import StageTimes
 from tiler.engine import Engine, LocalEngine
-from tiler.intent import can_be_continued, decide, find_ranges_known, layer_of
-from tiler.job import Job, make_target
-from tiler.ledger import Ledger
-from tiler.pieces import PieceRef
+from tiler.intent import Intent, decide, find_ranges_known
+from tiler.layerbuild import LayerBuild, Progress
+from tiler.leftovers import sweep
 from tiler.plan import Plan, plan_layer
-from tiler.publish import Published, find_superseded, publish_layer, publish_update
-from tiler.records import PlanRecord, RecordBook
 from tiler.samples import open_samples
 from tiler.sources.convert import SampleSource
 from tiler.stamps import SourceStamps
@@ -32,11 +28,7 @@ from tiler.stores import Claim, Store
 from tiler.stores.dataset import Dataset, read_manifest
 from tiler.stores.locate import open_store
 from tiler.stretch import Ranges, parse_stretch
-from tiler.tasks import Task, Tier
-from tiler.worker import Done, TaskWorker, Work
 
-Progress = Callable[[int, int], None]
-"""Called with (blocks finished, blocks in all), from any thread, one call at a time."""
 Outcome = Literal["built", "continued", "updated", "up to date"]
 
 
@@ -83,7 +75,9 @@ def build_layer(
         dataset = read_manifest(store)
         if dataset is None:
             refuse_foreign(store, claim)
-        workers = settings.workers or _processors()
+        else:
+            sweep(Dataset(store, dataset), claim)
+        workers = settings.workers or len(os.sched_getaffinity(0))
 
         def known_ranges(source: SampleSource) -> Ranges | None:
             return find_ranges_known(store, claim, dataset, source, settings)
@@ -91,16 +85,60 @@ def build_layer(
         samples = open_samples(sources, store.scratch, settings, workers, known_ranges)
         try:
             plan = plan_layer(samples, dataset, settings)
+            stamps = SourceStamps(samples.info)
+            intent = decide(store, claim, dataset, plan, stamps, settings)
+            if intent.act is None and dataset is not None:
+                return _up_to_date(store, claim, dataset, plan, intent, started)
             engine = engine or LocalEngine(plan.workers)
-            build = _Build(plan, sources, store, claim, dataset, SourceStamps(samples.info), settings, engine)
+            build = LayerBuild(plan, intent, sources, store, claim, dataset, stamps, settings, engine)
             build.run(on_progress)
         finally:
             samples.close()
-    return build.report(perf_counter() - started)
+    return _report(build, intent, claim, perf_counter() - started)
 
 
-def _processors() -> int:
-    return len(os.sched_getaffinity(0))
+def _up_to_date(store: Store, claim: Claim, dataset: Manifest, plan: Plan, intent: Intent, started: float) -> BuildReport:
+    """Clear what nobody will continue, and return the report of a build with nothing to do."""
+    for path in intent.obsolete:
+        if path not in {named for layer in dataset.layers.values() for named in layer.paths}:
+            store.delete_prefix(path)
+    claim.announce(*intent.kept)
+    return BuildReport(
+        manifest=dataset,
+        layer=plan.name,
+        outcome="up to date",
+        remarks=_remarks(plan, dataset.layers[plan.name]) + intent.remarks,
+        times=StageTimes(),
+        wall_s=perf_counter() - started,
+        megasamples=plan.lattice.width * plan.lattice.height / 1e6,
+        peak_rss_bytes=_peak_rss_bytes(),
+        tasks=plan.task_count,
+        tasks_kept=plan.task_count,
+        blocks_written=0,
+    )
+
+
+def _report(build: LayerBuild, intent: Intent, claim: Claim, wall_s: float) -> BuildReport:
+    plan, manifest = build.plan, build.manifest
+    if manifest is None:
+        raise UsageError("nothing was built")
+    continued = f"went on with what {claim.predecessor} had left: {build.kept} of {plan.task_count} tasks were finished"
+    outcome: Outcome = "built" if intent.record is None else "continued"
+    if intent.act == "update":
+        outcome = "updated" if build.changed else "up to date"
+    return BuildReport(
+        manifest=manifest,
+        layer=plan.name,
+        outcome=outcome,
+        remarks=_remarks(plan, manifest.layers[plan.name]) + intent.remarks + ((continued,) if claim.predecessor and build.kept else ()),
+        times=build.times,
+        wall_s=wall_s,
+        megasamples=plan.lattice.width * plan.lattice.height / 1e6,
+        peak_rss_bytes=_peak_rss_bytes(),
+        tasks=plan.task_count,
+        tasks_kept=build.kept,
+        blocks_written=build.written,
+    )
 
 
 def _peak_rss_bytes() -> int:
@@ -124,191 +162,6 @@ def refuse_foreign(store: Store, claim: Claim) -> None:
     foreign = () if claim.abandoned else sorted({key.partition("/")[0] for key in store.keys("")})
     if foreign:
         raise UsageError(f"{store.location}: not a dataset, and not empty (it holds {foreign[0]}); choose another folder for -o")
-
-
-class _Build:
-    """One build under its claim."""
-
-    def __init__(
-        self,
-        plan: Plan,
-        sources: Sequence[Path],
-        store: Store,
-        claim: Claim,
-        dataset: Manifest | None,
-        stamps: SourceStamps,
-        settings: BuildSettings,
-        engine: Engine,
-    ) -> None:
-        self._sources, self._store, self._claim, self._dataset = sources, store, claim, dataset
-        self._stamps, self._settings, self._engine = stamps, settings, engine
-        self._layer = None if dataset is None else dataset.layers.get(plan.name)
-        self._sweep(plan.name)
-        self._intent = decide(store, claim, dataset, plan, stamps, settings)
-        record = self._intent.record
-        # The records of another partition would be of no use, and blocks do not depend on it.
-        self.plan = plan if record is None else replace(plan, partition=record.partition)
-        self._book = RecordBook(store, self._intent.tasks_path)
-        self._times = StageTimes()
-        self._noted = self._kept = self._written = 0
-        self._changed = False
-        self.manifest = dataset
-
-    def _sweep(self, name: str) -> None:
-        """Delete what an update that was published, and then killed, did not come to delete."""
-        if self._layer is not None and set(self._claim.abandoned) & {patch.path for patch in self._layer.patches}:
-            self._store.delete(find_superseded(self._store, name, self._layer))
-
-    def run(self, on_progress: Progress) -> None:
-        """Do what is to be done, and delete what is superseded."""
-        intent = self._intent
-        foreign = [path for path in self._claim.abandoned if layer_of(path) != self.plan.name]
-        others = [path for path in foreign if can_be_continued(self._store, self._dataset, path)]
-        obsolete = [path for path in self._claim.abandoned if path not in others and path != intent.path]
-        if intent.act != "nothing":
-            replaced = self._layer.paths if self._layer is not None and intent.act == "build" else []
-            self._claim.announce(*others, *obsolete, *replaced, intent.path)
-            with self._kept_on_failure(others):
-                published = self._build(on_progress)
-            self.manifest, self._changed = published.manifest, published.changed
-            self._store.delete(published.superseded_keys)
-            obsolete += published.superseded_paths
-        self._delete(obsolete)
-        self._claim.announce(*others)
-
-    def _delete(self, paths: Sequence[str]) -> None:
-        """Delete of ``paths`` those that no manifest names; an update that changed nothing leaves an empty one."""
-        named = set() if self.manifest is None else {path for layer in self.manifest.layers.values() for path in layer.paths}
-        for path in {*paths, self._intent.path} - named:
-            self._store.delete_prefix(path)
-        if not self._settings.records and self._intent.act != "nothing":
-            self._book.delete()
-
-    @contextmanager
-    def _kept_on_failure(self, others: Sequence[str]) -> Iterator[None]:
-        """Say how much is kept when a build does not end; if no task was finished there is nothing to keep."""
-        try:
-            yield
-        except BaseException as error:
-            with suppress(ClipmapError):
-                # Of an update every task has a record, that of the published layer if no newer one.
-                finished = self._book.finished() if self._intent.act == "build" else self._noted
-                if finished > 0:
-                    error.add_note(f"{finished} of {self.plan.task_count} tasks are finished and kept: the same command goes on from there")
-                elif self._intent.act == "build" and self._intent.record is None:
-                    self._store.delete_prefix(self._intent.path)
-                    self._claim.announce(*others)
-            raise
-
-    def _build(self, on_progress: Progress) -> Published:
-        plan, intent = self.plan, self._intent
-        record = self._plan_record()
-        RecordBook(self._store, intent.path).write_plan(record)
-        ledger = Ledger(plan.lattice, plan.source.conversion.channels)
-        counter = _Counter(plan, on_progress)
-        published = None if self._dataset is None else Dataset(self._store, self._dataset)
-        target = make_target(plan, self._store, intent.path, published if intent.act == "update" else None)
-        worker = TaskWorker(plan, target, self._book, self._stamps, counter.add, self._job(record))
-        pieces: dict[Task, str] = {}
-        for tier in plan.tiers:
-            handed_on: dict[Task, str] = {}
-            # Closed however the loop ends, so that no task is under way any more when what is kept is counted.
-            with closing(self._engine.run(worker, self._works(worker, tier, pieces))) as finished:
-                for done in finished:
-                    self._note(done, ledger)
-                    if done.record.piece is not None:
-                        handed_on[done.task] = done.record.piece
-            pieces = handed_on
-        self._stamps.require_unchanged()
-        self._claim.confirm()
-        if intent.act == "update" and published is not None:
-            # Killed after the manifest and before the last line, the next build must not take the dataset for that of the old source.
-            self._book.write_plan(record.model_copy(update={"stamps": []}))
-            result = publish_update(plan, self._store, intent.path, ledger, published)
-            self._book.write_plan(record)
-            RecordBook(self._store, intent.path).delete()
-            return result
-        return publish_layer(plan, self._store, intent.path, ledger, self._dataset)
-
-    def _works(self, worker: TaskWorker, tier: Tier, pieces: dict[Task, str]) -> Iterator[Work]:
-        for task in self.plan.tasks(tier):
-            yield Work(task, tuple(PieceRef(below, pieces[below]) for below in worker.below(task)))
-
-    def _note(self, done: Done, ledger: Ledger) -> None:
-        ledger.enter(done.task, done.record)
-        self._noted += 1
-        self._times.add(done.times)
-        self._kept += done.kept
-        self._written += done.written
-
-    def _job(self, record: PlanRecord) -> Job:
-        intent = self._intent
-        return Job(
-            sources=[str(path.absolute()) for path in self._sources],
-            record=record,
-            path=intent.path,
-            tasks_path=intent.tasks_path,
-            update=intent.act == "update",
-            version=None if self._dataset is None else self._dataset.version,
-        )
-
-    def _plan_record(self) -> PlanRecord:
-        return PlanRecord(
-            signature=self.plan.signature,
-            place=self.plan.place,
-            partition=self.plan.partition,
-            sources=self._stamps.paths,
-            stamps=self._stamps.stamps,
-            ranges=list(self.plan.source.conversion.stretch or ()),
-            settings=self._settings.model_copy(update={"overwrite": False, "update": False, "break_lock": False}),
-        )
-
-    def report(self, wall_s: float) -> BuildReport:
-        """Return what was done."""
-        plan, manifest = self.plan, self.manifest
-        if manifest is None:
-            raise UsageError("nothing was built")
-        return BuildReport(
-            manifest=manifest,
-            layer=plan.name,
-            outcome=self._outcome(),
-            remarks=_remarks(plan, manifest.layers[plan.name]) + self._continued(),
-            times=self._times,
-            wall_s=wall_s,
-            megasamples=plan.lattice.width * plan.lattice.height / 1e6,
-            peak_rss_bytes=_peak_rss_bytes(),
-            tasks=plan.task_count,
-            tasks_kept=self._kept if self._intent.act != "nothing" else plan.task_count,
-            blocks_written=self._written,
-        )
-
-    def _outcome(self) -> Outcome:
-        if self._intent.act == "update":
-            return "updated" if self._changed else "up to date"
-        if self._intent.act == "nothing":
-            return "up to date"
-        return "built" if self._intent.record is None else "continued"
-
-    def _continued(self) -> tuple[str, ...]:
-        if self._intent.act == "nothing" or self._claim.predecessor is None or not self._kept:
-            return ()
-        return (f"went on with what {self._claim.predecessor} had left: {self._kept} of {self.plan.task_count} tasks were finished",)
-
-
-class _Counter:
-    """Counts finished blocks from any thread."""
-
-    def __init__(self, plan: Plan, on_progress: Progress) -> None:
-        counts = (plan.lattice.block_counts(level) for level in range(plan.lattice.levels))
-        self._total, self._done = sum(columns * rows for columns, rows in counts), 0
-        self._on_progress = on_progress
-        self._lock = threading.Lock()
-
-    def add(self, count: int) -> None:
-        """Count more blocks; a piece that had to be made again counts its task's blocks twice."""
-        with self._lock:
-            self._done = min(self._done + count, self._total)
-            self._on_progress(self._done, self._total)
 
 
 def _remarks(plan: Plan, layer: Layer) -> tuple[str, ...]:

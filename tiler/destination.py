@@ -32,7 +32,7 @@ class NewBlocks:
         self._path, self._name, self._levels, self._suffix = path, name, levels, suffix
 
     def key(self, address: BlockAddress, record: BlockRecord) -> str | None:
-        """Return the block's key under the path."""
+        """Return the block's key under the path; never None."""
         return block_key(self._path, self._name, address, self._levels, self._suffix)
 
     def holds(self, address: BlockAddress, record: BlockRecord) -> bool:
@@ -55,7 +55,10 @@ class ChangedBlocks(NewBlocks):
         self._published = published
 
     def _is_published(self, address: BlockAddress, record: BlockRecord) -> bool:
-        return self._published.record(self._name, address).digest == record.digest
+        try:
+            return self._published.record(self._name, address).digest == record.digest
+        except (InputError, NotFoundError):  # its index is damaged: then nothing is known of the published blocks
+            return False
 
     def key(self, address: BlockAddress, record: BlockRecord) -> str | None:
         """Return the block's key under the path; None if the published layer has the same bytes."""

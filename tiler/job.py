@@ -119,9 +119,8 @@ def _read(store: Store, ref: JobRef) -> Job:
 
 
 def _check_same(record: PlanRecord, stamps: SourceStamps, plan: Plan) -> None:
-    known = dict(zip(record.sources, record.stamps, strict=True))
-    for path, stamp in zip(stamps.paths, stamps.stamps, strict=True):
-        if known.get(path) != stamp:
+    for path, stamp, known in zip(stamps.paths, stamps.stamps, record.stamps, strict=False):
+        if known != stamp:
             raise InputError(f"{path}: a worker sees another state of the file than the build does; let all read the same file")
     if difference := record.explain(plan.signature):
         raise UsageError(f"a worker would make other blocks ({difference} there); install the same versions on all machines")

@@ -42,6 +42,10 @@ class Ledger:
         """Return the bytes of the block index of ``level``."""
         return bytes(self._records[level])
 
+    def stored(self, level: int) -> bytes:
+        """Return the bitmap of the blocks of ``level`` that are stored: row order, lowest bit first."""
+        return bytes(self._stored[level])
+
     def level(self, level: int) -> Level:
         """Return the manifest's entry for ``level``."""
         width, height = self._lattice.level_size(level)

@@ -93,9 +93,14 @@ class Plan:
             "linear-light": self.linear_light,
             "fill": self.fill,
             "enhance": self.enhance,
-            "clipmap": version("clipmap"),
-            "imagecodecs": version("imagecodecs"),
+            **{name: version(name) for name in self.libraries},
         }
+
+    @property
+    def libraries(self) -> list[str]:
+        """The packages whose next version may make other bytes: of this plan, and only those that it uses."""
+        names = ["clipmap", "OpenEXR" if self.codec.spec.startswith("exr") else "imagecodecs"]
+        return names + ["rasterio"] * bool(self.source.info.parts) + ["PyWavelets"] * (self.enhance is not None)
 
     @cached_property
     def digest(self) -> str:

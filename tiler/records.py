@@ -7,17 +7,17 @@ the float32 samples that it hands to the next tier. A task's record is written a
 
 import json
 from base64 import b64decode, b64encode
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from fractions import Fraction
 from math import inf
-from typing import Any, Final, Self
+from typing import Any, Final, Literal, Self, TypeVar
 
 from pydantic import Field, JsonValue, ValidationError
 
 from schemas.address import BlockAddress
 from schemas.blockindex import RECORD_BYTES, BlockIndex, BlockRecord, pack_record
 from schemas.errors import NotFoundError
-from schemas.manifest import Digest, Model
+from schemas.manifest import Digest, Model, digest
 from schemas.settings import BuildSettings
 from tiler.cut import CutBlock
 from tiler.sources import Layout
@@ -25,6 +25,8 @@ from tiler.stores import Store
 from tiler.tasks import Task
 
 TASKS: Final = "tasks"
+Act = Literal["build", "update"]
+Document = TypeVar("Document", bound=Model)
 
 
 class Partition(Model):
@@ -37,17 +39,19 @@ class Partition(Model):
 class PlanRecord(Model):
     """What is built, from what, and how it is cut into tasks."""
 
+    act: Act = Field(description="Whether all blocks lie under the path, or those that an update changes")
     signature: dict[str, JsonValue] = Field(description="Everything that a block's bytes depend on besides the source's pixels")
     place: dict[str, JsonValue] = Field(description="Where the layer lies; only the manifest depends on it")
     partition: Partition
-    sources: list[str] = Field(description="Absolute paths of the source files")
-    stamps: list[str] = Field(description="State of every source file: size and time of change")
+    sources: list[str] = Field(description="Absolute paths of the source files, in the order in which they were given")
+    stamps: list[str] = Field(description="State of every source file: path, size and time of change; empty while an update is published")
     settings: BuildSettings
     ranges: list[tuple[float, float]] = Field(default=[], description="What a stretch found to become 0 to 255, per channel")
 
-    def explain(self, signature: dict[str, JsonValue]) -> str:
-        """Return in what this plan's signature differs from another one, for messages; '' if in nothing."""
-        names = [name for name in signature | self.signature if signature.get(name) != self.signature.get(name)]
+    def explain(self, signature: dict[str, JsonValue], ignored: Collection[str] = ()) -> str:
+        """Return in what this plan's signature differs from another one, for messages; '' if in nothing but what is ``ignored``."""
+        both = (name for name in signature | self.signature if name not in ignored)
+        names = [name for name in both if signature.get(name) != self.signature.get(name)]
         return ", ".join(f"{name} was {_said(self.signature.get(name))}, now {_said(signature.get(name))}" for name in names[:3])
 
 
@@ -101,6 +105,11 @@ class TaskRecord(Model):
                     number += 1
 
 
+def _check(key: str, record: object) -> str:
+    """Return the digest that a record must have: builds rely on records, so a flipped bit must not go unnoticed."""
+    return digest(f"{key}\n{json.dumps(record, sort_keys=True)}".encode())
+
+
 class RecordBook:
     """The records of one layer in a store; safe to use from several threads and processes."""
 
@@ -113,26 +122,32 @@ class RecordBook:
         return f"{self._prefix}/{task.tier.first}/{task.core.y0}/{task.core.x0}.{suffix}"
 
     def plan(self) -> PlanRecord | None:
-        """Return the plan; None if there is none, or none that this version understands."""
-        try:
-            return PlanRecord.model_validate_json(self._store.read(f"{self._prefix}/plan.json"))
-        except (NotFoundError, ValidationError):
-            return None
+        """Return the plan; None if there is none, a damaged one, or one that this version does not understand."""
+        return self._read(f"{self._prefix}/plan.json", PlanRecord)
 
     def write_plan(self, plan: PlanRecord) -> None:
         """Put the plan down."""
-        self._store.write(f"{self._prefix}/plan.json", plan.model_dump_json(indent=1).encode())
+        self._write(f"{self._prefix}/plan.json", plan)
 
     def read(self, task: Task) -> TaskRecord | None:
         """Return a task's record; None if there is none, or a damaged one."""
-        try:
-            return TaskRecord.model_validate_json(self._store.read(self._key(task, "json")))
-        except (NotFoundError, ValidationError):
-            return None
+        return self._read(self._key(task, "json"), TaskRecord)
 
     def write(self, task: Task, record: TaskRecord) -> None:
         """Put a task's record down: from now on the task counts as finished."""
-        self._store.write(self._key(task, "json"), record.model_dump_json().encode())
+        self._write(self._key(task, "json"), record)
+
+    def _read(self, key: str, kind: type[Document]) -> Document | None:
+        try:
+            found = json.loads(self._store.read(key))
+            return kind.model_validate(found["record"]) if found["check"] == _check(key, found["record"]) else None
+        except (NotFoundError, ValidationError, ValueError, TypeError, KeyError):
+            return None
+
+    def _write(self, key: str, document: Model) -> None:
+        # Not by pydantic, in whose JSON a nodata value of NaN would be none.
+        record = json.loads(json.dumps(document.model_dump()))
+        self._store.write(key, json.dumps({"check": _check(key, record), "record": record}, indent=1).encode())
 
     def read_piece(self, task: Task) -> bytes:
         """Return the bytes a task handed on; raises NotFoundError."""

@@ -4,14 +4,14 @@ What is restored has the digest that the manifest vouches for, so a repaired dat
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from schemas.address import BlockAddress
 from schemas.errors import ClipmapError, InputError, NotFoundError, StorageError
 from schemas.findings import Finding, VerifyReport
-from schemas.manifest import Layer, digest
+from schemas.manifest import digest
 from tiler.cut import Target
 from tiler.destination import DamagedBlocks
 from tiler.engine import run_tasks
@@ -39,7 +39,9 @@ def verify_and_repair(
     The report has the findings that are left, those that were mended, and why others could not be. Keeps builds out meanwhile.
     Raises what ``verify`` raises, and StorageError if the dataset cannot be written.
     """
-    with dataset.store.exclusive():
+    with dataset.store.exclusive() as claim:
+        # So that the next build clears what a repair that is killed leaves half-written.
+        claim.announce(*claim.abandoned, *(path for layer in dataset.manifest.layers.values() for path in layer.paths))
         if read_manifest(dataset.store) != dataset.manifest:
             raise StorageError(f"{dataset.store.location}: was rebuilt meanwhile; run clipmap verify again")
         before = report = verify(dataset, names, checks, on_progress)
@@ -52,6 +54,8 @@ def verify_and_repair(
         notes += _each_layer(fresh, report, checks, _Repair.restore_blocks)
         found = {_key(each): each for each in [*before.findings, *report.findings]}
         after = verify(Dataset(dataset.store, dataset.manifest), names, checks) if found else report
+        dataset.store.sync()
+        claim.announce(*claim.abandoned)
     left = {_key(each) for each in after.findings}
     repaired = [each.model_copy(update={"remedy": "restored"}) for key, each in found.items() if key not in left]
     return after.model_copy(update={"repaired": repaired, "notes": list(dict.fromkeys(notes))})
@@ -83,30 +87,26 @@ def _each_layer(dataset: Dataset, report: VerifyReport, checks: Checks, restore:
     return notes
 
 
-@dataclass
 class _Repair:
-    """The means to make parts of one layer again: its plan, from the records of its build, and its source."""
+    """The means to make parts of one layer again: its plan, from the records of its build, and its source.
 
-    dataset: Dataset
-    name: str
-    findings: list[Finding]
-    workers: int
-    notes: list[str] = field(default_factory=list)
+    Raises InputError if there are none. ``notes`` says what could not be restored, and why.
+    """
 
-    def __post_init__(self) -> None:
-        self._book = RecordBook(self.dataset.store, self._layer.path)
+    def __init__(self, dataset: Dataset, name: str, findings: list[Finding], workers: int) -> None:
+        self._dataset, self._name, self._findings, self._workers = dataset, name, findings, workers
+        self._layer = dataset.manifest.layer(name)
+        self._book = RecordBook(dataset.store, self._layer.path)
+        self.notes: list[str] = []
         record = self._book.plan()
         if record is None:
             raise InputError("there are no records of how the layer was built; rebuild it (clipmap build --overwrite)")
-        self._source = _reopened(self.dataset, record, self.workers)
-        self._plan = replace(plan_layer(self._source, self.dataset.manifest, record.settings), partition=record.partition)
-        if difference := record.explain(self._plan.signature):
+        self._source = _reopened(dataset, record, workers)
+        self._plan = replace(plan_layer(self._source, dataset.manifest, record.settings), partition=record.partition)
+        # Of other versions of libraries the same bytes are likely, and whether they are is checked block by block.
+        if difference := record.explain(self._plan.signature, ignored=self._plan.libraries):
             self.close()
             raise InputError(f"the layer cannot be made again as it was ({difference}); rebuild it (clipmap build --overwrite)")
-
-    @property
-    def _layer(self) -> Layer:
-        return self.dataset.manifest.layer(self.name)
 
     def close(self) -> None:
         """Close the source."""
@@ -114,13 +114,13 @@ class _Repair:
 
     def _worker(self, destination: DamagedBlocks) -> TaskWorker:
         plan = self._plan
-        target = Target(self.dataset.store, destination, plan.lattice, plan.block, plan.codec, plan.linear_light)
+        target = Target(self._dataset.store, destination, plan.lattice, plan.block, plan.codec, plan.linear_light)
         return TaskWorker(plan, target, self._book, SourceStamps(self._source.info))
 
     def restore_indexes(self) -> None:
         """Put the indexes together from the task records again."""
-        levels = {found.level for found in self.findings if _is_index(found)}
-        worker = self._worker(DamagedBlocks(self.dataset, self.name, ()))
+        levels = {found.level for found in self._findings if _is_index(found)}
+        worker = self._worker(DamagedBlocks(self._dataset, self._name, ()))
         ledger = Ledger(self._plan.lattice, self._source.conversion.channels)
         for tier in self._plan.tiers:
             if levels & set(range(tier.first, tier.first + tier.count)):
@@ -129,31 +129,34 @@ class _Repair:
         for level in sorted(level for level in levels if level is not None):
             data = ledger.index(level)
             if digest(data) == self._layer.levels[level].index:
-                self.dataset.store.write(self._layer.index_key(level), data)
+                self._dataset.store.write(self._layer.index_key(level), data)
             else:
-                self.notes.append(f"{self.name}: the index of level {level} cannot be restored, the task records are newer; {_UPDATE}")
+                self.notes.append(f"{self._name}: the index of level {level} cannot be restored, the task records are newer; {_UPDATE}")
 
     def restore_blocks(self) -> None:
         """Make damaged blocks again, and delete the files of blank ones."""
         damaged: set[BlockAddress] = set()
-        for found in self.findings:
+        for found in self._findings:
             if found.level is None or found.x is None or found.y is None:
                 continue
             address = BlockAddress(found.level, found.x, found.y)
             if found.kind == "stray":
-                self.dataset.store.delete([found.file])
+                self._dataset.store.delete([found.file])
             elif found.kind in _BLOCK_DAMAGE:
                 damaged.add(address)
-        destination = DamagedBlocks(self.dataset, self.name, damaged)
+        destination = DamagedBlocks(self._dataset, self._name, damaged)
         worker = self._worker(destination)
 
         def run(task: Task) -> None:
-            worker.run(Work(task, worker.pieces(task)))
+            try:
+                worker.run(Work(task, worker.pieces(task)))
+            except InputError as error:
+                self.notes.append(f"{self._name}: not all could be restored: {error}")
 
-        for _ in run_tasks(run, _tasks_of(self._plan, damaged), self.workers):
+        for _ in run_tasks(run, _tasks_of(self._plan, damaged), self._workers):
             pass
         for address in sorted(destination.differing):
-            self.notes.append(f"{self.name}/{address}: cannot be restored, the source gives another block now; {_UPDATE}")
+            self.notes.append(f"{self._name}/{address}: cannot be restored, the source gives another block now; {_UPDATE}")
 
 
 _UPDATE: Final = "bring the source back as it was, or run clipmap build --update"

@@ -52,7 +52,7 @@ def find_standing(
     except UsageError as error:
         return _refused(plan, str(error))
     tasks = plan.task_count if intent.record is None else replace(plan, partition=intent.record.partition).task_count
-    if intent.act == "nothing":
+    if intent.act is None:
         return Standing(act="nothing", sentence="up to date: nothing to do", tasks=tasks, tasks_finished=tasks)
     if intent.act == "update":
         sentence = "update: read the whole source, rebuild the tasks whose pixels have changed"

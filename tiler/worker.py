@@ -174,9 +174,7 @@ class TaskWorker:
     def _push(self, work: Work, cascade: Cascade, whole: Rect, times: StageTimes) -> str:
         """Push the task's window through the cascade; return the digest of what was read of the source, '' if nothing was."""
         plan, first = self._plan, work.task.tier.first
-        samples = (
-            plan.source if first == 0 else PieceReader(work.pieces, self._load_all, plan.source.conversion.channels, plan.recipe.masked)
-        )
+        samples = plan.source if first == 0 else PieceReader(work.pieces, self._load, plan.source.conversion.channels, plan.recipe.masked)
         plan.source.begin()
         started = perf_counter()
         for window in self._portions(work.task, whole):
@@ -189,24 +187,27 @@ class TaskWorker:
         times.filter_s = perf_counter() - started - times.read_s - times.encode_s - times.write_s
         return "" if first else plan.source.digest()
 
-    def _load_all(self, pieces: Sequence[PieceRef]) -> list[bytes]:
-        return read_all(self._target.store, self._load, pieces)
+    def _load(self, pieces: Sequence[PieceRef]) -> list[bytes]:
+        """Return the bytes of pieces; one that is lost or damaged is made again by the task that it came from, on this thread."""
+        found = read_all(self._target.store, self._stored_piece, pieces)
+        return [self._made_again(piece) if data is None else data for piece, data in zip(pieces, found, strict=True)]
 
-    def _load(self, piece: PieceRef) -> bytes:
-        """Return the bytes of a piece; a lost or damaged one is made again by the task that it came from."""
-        for attempt in range(2):
-            try:
-                data = self._book.read_piece(piece.task)
-            except NotFoundError:
-                data = b""
-            if digest(data) == piece.digest:
-                return data
-            if attempt == 0:
-                self.run(Work(piece.task, self.pieces(piece.task)))
-        raise InputError(
-            f"{self._plan.source.info.path}: does not give the samples again that it gave before, so the finished part of the build "
-            "does not go with it; begin anew with --overwrite"
-        )
+    def _stored_piece(self, piece: PieceRef) -> bytes | None:
+        try:
+            data = self._book.read_piece(piece.task)
+        except NotFoundError:
+            return None
+        return data if digest(data) == piece.digest else None
+
+    def _made_again(self, piece: PieceRef) -> bytes:
+        self.run(Work(piece.task, self.pieces(piece.task)))
+        data = self._stored_piece(piece)
+        if data is None:
+            raise InputError(
+                f"{self._plan.source.info.path}: does not give the samples again that it gave before; run clipmap build again, with "
+                "--update if the layer is finished"
+            )
+        return data
 
     def ensure(self, task: Task) -> TaskRecord:
         """Return a task's record; one that is missing or of another plan is made by running the task."""

@@ -24,7 +24,7 @@ from tests.reference.terrain import photo
 from tiler import batch
 from tiler.batch import Bounds, run_batch
 from tiler.build import build_layer
-from tiler.jobs import Job, explain_death
+from tiler.batchjobs import Job, explain_death
 from tiler.machine import PROCESS_BYTES
 from tiler.stores.dataset import open_dataset
 

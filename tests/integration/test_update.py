@@ -86,7 +86,7 @@ def test_an_unchanged_source_is_up_to_date(tmp_path: Path) -> None:
         again = build_layer(source, tmp_path / "out", settings(codec="png", update=update))
         assert (again.outcome, again.manifest, again.blocks_written) == ("up to date", first.manifest, 0)
     os.utime(source, (1, 1))
-    with pytest.raises(UsageError, match="the source has changed since; add --update"):
+    with pytest.raises(UsageError, match="the source has changed since, or is another file; add --update"):
         build_layer(source, tmp_path / "out", settings(codec="png"))
     again = build_layer(source, tmp_path / "out", settings(codec="png", update=True))
     assert (again.outcome, again.manifest, again.tasks_kept) == ("up to date", first.manifest, again.tasks)
@@ -129,7 +129,7 @@ def test_a_change_behind_a_vrt_is_seen(tmp_path: Path) -> None:
     build_layer(tmp_path / "photo.vrt", tmp_path / "out", settings(codec="png"))
     pixels[:9, :9] ^= 0xFF
     write_tiff(source, pixels)
-    with pytest.raises(UsageError, match="the source has changed since; add --update"):
+    with pytest.raises(UsageError, match="the source has changed since, or is another file; add --update"):
         build_layer(tmp_path / "photo.vrt", tmp_path / "out", settings(codec="png"))
     assert build_layer(tmp_path / "photo.vrt", tmp_path / "out", settings(codec="png", update=True)).outcome == "updated"
 

@@ -90,7 +90,7 @@ def changed_signature(job: dict[str, Any]) -> None:
         (changed(version="0" * 32), StorageError, "a worker sees another version of the dataset than the build does"),
         (changed(novelty=1), UsageError, "does not understand the build; install the same version of clipmap"),
         (changed_record(stamps=["1:1"]), InputError, r"photo\.tif: a worker sees another state of the file than the build does"),
-        (changed_record(sources=["/elsewhere/photo.tif"]), InputError, "a worker sees another state of the file"),
+        (changed_record(stamps=["/elsewhere/photo.tif 1 1"]), InputError, "a worker sees another state of the file"),
         (changed_signature, UsageError, r"a worker would make other blocks \(imagecodecs was 2099\.1, now .* there\)"),
         (changed(sources=["/nowhere/photo.tif"]), InputError, "/nowhere/photo.tif: no such file"),
     ],

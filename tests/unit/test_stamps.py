@@ -37,6 +37,16 @@ def test_size_and_time_of_change_count(tmp_path: Path) -> None:
     assert stamp_file(path) != first
 
 
+def test_another_file_of_the_same_size_and_time_is_another(tmp_path: Path) -> None:
+    """2026-11-22: a build of one tile was taken for that of another: all tiles of an elevation model have one size."""
+    stamps = []
+    for name in ("n46e010.hgt", "n46e011.hgt"):
+        (tmp_path / name).write_bytes(b"heights")
+        os.utime(tmp_path / name, (9, 9))
+        stamps.append(stamp_file(tmp_path / name))
+    assert stamps[0] != stamps[1]
+
+
 @pytest.mark.parametrize("suffix", [".msk", ".aux.xml"])
 def test_files_beside_the_source_count(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / "a.tif"

@@ -10,9 +10,9 @@ from typing import Final, NoReturn
 
 from schemas.batch import JobReport
 from schemas.errors import ClipmapError
+from tiler.batchjobs import Answer, Build, Built, Check, Checked, Request
 from tiler.build import build_layer
 from tiler.estimate import plan_from_headers
-from tiler.jobs import Answer, Build, Built, Check, Checked, Request
 from tiler.memory import build_memory_bytes
 
 _LAST_S: Final = 60.0

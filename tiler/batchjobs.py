@@ -1,7 +1,7 @@
 """Jobs of a batch, and the processes in which they run: each does many, so that kernels are loaded once, and may die without harm.
 
 A process is a new interpreter that gets one end of a socket pair. It answers one request after the other, and ends when the other end
-is closed, which the kernel does however the process of the batch ends. What it does is in ``tiler.jobserver``.
+is closed, which the kernel does however the process of the batch ends. What it does is in ``tiler.batchserver``.
 """
 
 import signal
@@ -16,7 +16,7 @@ from typing import Any, Final
 from schemas.batch import JobReport
 from schemas.settings import BuildSettings
 
-_PROGRAM: Final = "import sys; from tiler.jobserver import serve; serve(int(sys.argv[1]))"
+_PROGRAM: Final = "import sys; from tiler.batchserver import serve; serve(int(sys.argv[1]))"
 
 
 @dataclass(frozen=True, slots=True)
