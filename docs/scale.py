@@ -3,7 +3,7 @@
     .venv/bin/python docs/scale.py
 
 Reads ``tests/bench/results/scale-tasks.csv`` and ``scale.json``, which ``tests/bench/scale.py`` writes. A discrete simulation, one
-event per task: cores take tasks in order; a task lasts as long as a measured one, plus its share of waiting for the store; the store
+event per task: cores take tasks in order; a task lasts as long as a measured one, or as its writes take if that is longer; the store
 answers so many requests a second and no more; the coordinating process enters one result after the other, and no more than two tasks
 per core are handed out before it has; a tier begins when the one below has ended. Deterministic; takes a minute.
 """
@@ -27,8 +27,8 @@ SIDE: Final = 1 << 25
 """Samples a side: 1.126 petapixels."""
 LATENCY_S: Final = 0.02
 """Of one request to an object store."""
-THREADS_PER_CORE: Final = 4
-"""While one waits for the store the others work."""
+IN_FLIGHT: Final = 16
+"""Writes of one task that are under way at the same time, see ``tiler/overlap.py``; the task goes on meanwhile."""
 REQUESTS_PER_S: Final = 3500
 """Writes that one prefix of S3 takes at least; every level has its own."""
 CORES: Final = (100, 1_000, 10_000)
@@ -55,6 +55,11 @@ class Config:
         return (SIDE // self.block) ** 2
 
     @property
+    def datasets(self) -> int:
+        """How many datasets the petapixel takes: each has prefixes of its own in the store, and a build of its own, at the same time."""
+        return max(1, self.blocks // MAX_BLOCKS)
+
+    @property
     def levels_per_tier(self) -> int:
         """Levels that a task makes."""
         return (self.task // self.block).bit_length() - 1
@@ -64,15 +69,15 @@ class Config:
         """Number of tasks of every tier."""
         found, side = [], SIDE
         while side >= self.block:
-            found.append(-((-side // self.task) ** 2))
+            found.append(max(1, side // self.task) ** 2)
             side >>= self.levels_per_tier
         return found
 
     @property
     def coordinator_s(self) -> float:
-        """What one result costs the coordinating process."""
+        """What one result costs the coordinating processes, of which there is one per dataset."""
         blocks = sum((self.task // self.block >> step) ** 2 for step in range(self.levels_per_tier))
-        return self.engine_s + blocks * self.ledger_s
+        return (self.engine_s + blocks * self.ledger_s) / self.datasets
 
 
 @dataclass(frozen=True)
@@ -115,7 +120,8 @@ def simulate(config: Config, cores: int) -> Outcome:
     chance = random.Random(1)
     clock = work_s = store_s = coordinator_s = 0.0
     ends: list[float] = []
-    wait_s = config.requests * LATENCY_S / THREADS_PER_CORE
+    wait_s = config.requests * LATENCY_S / IN_FLIGHT
+    rate = REQUESTS_PER_S * config.datasets
     for count in config.tiers:
         simulated = min(count, ENOUGH_TASKS)
         free = [clock] * min(cores, simulated)
@@ -126,13 +132,13 @@ def simulate(config: Config, cores: int) -> Outcome:
             if len(handed_out) == 2 * cores:
                 start = max(start, handed_out.popleft())
             seconds = max(chance.choice(config.seconds), wait_s)
-            store = max(store, start) + config.requests / REQUESTS_PER_S
+            store = max(store, start) + config.requests / rate
             end = max(start + seconds, store)
             heapq.heappush(free, end)
             coordinator = max(coordinator, end) + config.coordinator_s
             handed_out.append(coordinator)
             work_s += seconds * count / simulated
-        store_s += count * config.requests / REQUESTS_PER_S
+        store_s += count * config.requests / rate
         coordinator_s += count * config.coordinator_s
         clock += (max(coordinator, *free) - clock) * count / simulated
         ends.append(clock)
@@ -141,15 +147,14 @@ def simulate(config: Config, cores: int) -> Outcome:
 
 def amounts(configs: list[Config]) -> str:
     """Return the table of what has to be made and kept."""
-    lines = ["| block, task | tasks | blocks | stored | index | scratch (pieces) | one dataset? |", "|---" * 7 + "|"]
+    lines = ["| block, task | tasks | blocks | stored | index | scratch (pieces) | datasets |", "|---" * 7 + "|"]
     for config in configs:
         blocks = config.blocks * 4 / 3
         stored = config.stored_bytes_per_px * SIDE * SIDE
         pieces = SIDE * SIDE / 4**config.levels_per_tier * 12 * 16 / 15
-        one = "yes" if config.blocks <= MAX_BLOCKS else f"no: {config.blocks // MAX_BLOCKS} datasets"
         lines.append(
             f"| {config.block}, {config.task} | {sum(config.tiers):,} | {blocks:.2g} | {stored / 1e12:,.0f} TB "
-            f"| {blocks * 32 / 1e9:,.1f} GB | {pieces / 1e12:,.0f} TB | {one} |"
+            f"| {blocks * 32 / 1e9:,.1f} GB | {pieces / 1e12:,.0f} TB | {config.datasets} |"
         )
     return "\n".join(lines)
 
