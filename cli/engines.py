@@ -9,7 +9,7 @@ import click
 from schemas.errors import UsageError
 
 if TYPE_CHECKING:
-    from tiler.engine import Engine
+    from tiler.tasks.engine import Engine
 
 
 @contextmanager
@@ -22,7 +22,7 @@ def open_engine(name: str, scheduler: str | None) -> Iterator["Engine | None"]:
         return
     if scheduler is None:
         raise UsageError("--engine dask needs the address of the scheduler, e.g. --scheduler tcp://head:8786")
-    from tiler.cluster import DaskEngine
+    from tiler.cluster.engine import DaskEngine
 
     with DaskEngine(scheduler, lambda sentence: click.echo(f"note: {sentence}", err=True)) as engine:
         yield engine

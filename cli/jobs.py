@@ -13,7 +13,7 @@ from schemas.errors import InputError, NotFoundError, UsageError
 from schemas.settings import BuildSettings
 
 if TYPE_CHECKING:
-    from tiler.batchjobs import Job
+    from tiler.batch.jobs import Job
 
 _SIDECARS: Final = (".aux.xml", ".msk", ".ovr")
 """Files that GDAL keeps beside a raster; they belong to it."""
@@ -36,7 +36,7 @@ def read_jobs(arguments: Sequence[str], folder: str, given: Mapping[str, Any]) -
 
 
 def _from_sources(arguments: Sequence[str], folder: str, given: Mapping[str, Any]) -> list[tuple["Job", str]]:
-    from tiler.batchjobs import Job
+    from tiler.batch.jobs import Job
 
     settings = _settings(given, "the command line")
     return [(Job((path,), _joined(folder, path.stem), settings), "") for path in _matches(arguments, Path())]
@@ -90,7 +90,7 @@ def _from_toml(path: Path, folder: str, given: Mapping[str, Any]) -> list[tuple[
 def _jobs_of(
     table: Mapping[str, Any], path: Path, where: str, folder: str, around: tuple[Mapping[str, Any], Mapping[str, Any]]
 ) -> list[tuple["Job", str]]:
-    from tiler.batchjobs import Job
+    from tiler.batch.jobs import Job
 
     named = _named(table, _JOB_KEYS, where)
     patterns, output = _sources(named.pop("sources", None), where), named.pop("output", None)

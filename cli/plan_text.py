@@ -12,7 +12,7 @@ from schemas.settings import BuildSettings
 
 def show_plan(sources: Sequence[Path], output: str, settings: BuildSettings, as_json: bool) -> None:
     """Print what a build with these arguments would make and take; nothing is written at ``output``."""
-    from tiler.estimate import estimate_build
+    from tiler.estimate.build import estimate_build
 
     estimate = estimate_build(sources, output, settings)
     if as_json:

@@ -28,7 +28,7 @@ SIDE: Final = 1 << 25
 LATENCY_S: Final = 0.02
 """Of one request to an object store."""
 IN_FLIGHT: Final = 16
-"""Writes of one task that are under way at the same time, see ``tiler/overlap.py``; the task goes on meanwhile."""
+"""Writes of one task that are under way at the same time, see ``tiler/tasks/overlap.py``; the task goes on meanwhile."""
 REQUESTS_PER_S: Final = 3500
 """Writes that one prefix of S3 takes at least; every level has its own."""
 CORES: Final = (100, 1_000, 10_000)

@@ -5,9 +5,9 @@ import numpy as np
 from schemas.lattice import Registration
 from schemas.manifest import KernelName
 from schemas.region import Rect
-from tiler.cascade import Cascade, Coverage, Recipe, Values, held_windows
-from tiler.edges import EdgeRule
-from tiler.kernels import DESIGNS
+from tiler.filters.cascade import Cascade, Coverage, Recipe, Values, held_windows
+from tiler.filters.edges import EdgeRule
+from tiler.filters.kernels import DESIGNS
 
 LevelRows = tuple[Rect, Values, Coverage | None]
 HEIGHT: tuple[Registration, EdgeRule] = ("point", "antisymmetric")

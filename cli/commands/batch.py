@@ -71,8 +71,8 @@ def command(
     given = {name: value for name, value in options.items() if context.get_parameter_source(name) == ParameterSource.COMMANDLINE}
     build_settings(given)
     listed = read_jobs(jobs, output, given)
-    from tiler.batch import Bounds, run_batch
-    from tiler.machine import available_bytes
+    from tiler.batch.run import Bounds, run_batch
+    from tiler.estimate.machine import available_bytes
 
     if memory is None and (free := available_bytes()) is not None:
         memory = int(_SHARE * free)

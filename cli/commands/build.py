@@ -13,7 +13,7 @@ from schemas.manifest import KernelName
 from schemas.settings import MAX_SAMPLES
 
 if TYPE_CHECKING:
-    from tiler.build import BuildReport
+    from tiler.building.build import BuildReport
 
 
 @click.command(short_help="Build a layer of a dataset from a source image or elevation model.")
@@ -110,7 +110,7 @@ def command(
         show_plan(sources, output, settings, as_json)
         return
     with progress_bar("blocks") as on_progress, open_engine(engine, scheduler) as runner:
-        from tiler.build import build_layer
+        from tiler.building.build import build_layer
 
         report = build_layer(sources, output, settings, on_progress, runner)
     show_report(report, output, as_json)

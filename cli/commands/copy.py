@@ -10,7 +10,7 @@ from cli.progress import progress_bar
 from schemas.errors import UsageError
 
 if TYPE_CHECKING:
-    from tiler.copying import CopyReport
+    from tiler.archives.copying import CopyReport
 
 
 @click.command(short_help="Copy a dataset to another folder or store, or into archives.")
@@ -44,7 +44,7 @@ def command(source: str, target: str, form: str, names: tuple[str, ...], workers
     clipmap copy out/alps out/alps-archive --store archive
     clipmap copy out/alps s3://bucket/alps --workers 64
     """
-    from tiler.copying import copy_dataset
+    from tiler.archives.copying import copy_dataset
     from tiler.stores.archive import ArchiveStore
     from tiler.stores.dataset import open_dataset
     from tiler.stores.locate import open_store

@@ -31,7 +31,7 @@ def command(a: str, b: str, workers: int | None, as_json: bool) -> int:
     \b
     clipmap diff out/alps out/alps-new
     """
-    from tiler.diff import diff
+    from tiler.checking.diff import diff
     from tiler.stores.dataset import open_dataset
 
     datasets = open_dataset(a), open_dataset(b)

@@ -83,7 +83,7 @@ def command(
 def _inspect_place(
     dataset: Dataset, target: str | None, at: Pair | None, at_world: Pair | None, at_pixel: tuple[int, int] | None, as_json: bool
 ) -> int:
-    from tiler.probe import probe_geographic, probe_pixel, probe_world
+    from tiler.inspecting.probe import probe_geographic, probe_pixel, probe_world
 
     names = list(dataset.manifest.layers)
     if target is not None:
@@ -104,7 +104,7 @@ def _inspect_place(
 
 
 def _inspect_part(dataset: Dataset, target: str | None, png: Path | None, as_json: bool) -> int:
-    from tiler.inspection import describe_dataset, describe_layer, describe_level, parse_target
+    from tiler.inspecting.facts import describe_dataset, describe_layer, describe_level, parse_target
 
     name, level, address = ("", None, None) if target is None else parse_target(dataset, target)
     if address is not None:
@@ -127,8 +127,8 @@ def _inspect_part(dataset: Dataset, target: str | None, png: Path | None, as_jso
 
 
 def _inspect_block(dataset: Dataset, name: str, address: BlockAddress, png: Path | None, as_json: bool) -> int:
-    from tiler.inspection import describe_block
-    from tiler.preview import preview_png
+    from tiler.inspecting.facts import describe_block
+    from tiler.inspecting.preview import preview_png
 
     facts, decoded = describe_block(dataset, name, address)
     if png is not None:

@@ -39,15 +39,15 @@ def command(dataset: str, layers: tuple[str, ...], seams: bool, quick: bool, rep
     clipmap verify out/alps --layer height --seams
     clipmap verify out/alps --repair
     """
+    from tiler.checking.verify import Checks, verify
     from tiler.stores.dataset import open_dataset
-    from tiler.verify import Checks, verify
 
     checks = Checks(decode=not quick, seams=seams, workers=workers)
 
     opened = open_dataset(dataset)
     with progress_bar("blocks") as on_progress:
         if repair:
-            from tiler.repair import verify_and_repair
+            from tiler.checking.repair import verify_and_repair
 
             report = verify_and_repair(opened, layers or None, checks, on_progress)
         else:

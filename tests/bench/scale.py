@@ -25,12 +25,12 @@ from schemas.blockindex import BlockRecord
 from schemas.lattice import Lattice
 from schemas.settings import BuildSettings
 from tests.bench.stages import RESULTS, write_source
-from tiler.build import build_layer
-from tiler.cut import CutBlock
-from tiler.ledger import Ledger
-from tiler.records import TaskRecord
-from tiler.tasks import Task, plan_tasks, plan_tiers
-from tiler.worker import Done, TaskWorker, Work
+from tiler.building.build import build_layer
+from tiler.tasks.cut import CutBlock
+from tiler.tasks.ledger import Ledger
+from tiler.tasks.partition import Task, plan_tasks, plan_tiers
+from tiler.tasks.records import TaskRecord
+from tiler.tasks.worker import Done, TaskWorker, Work
 
 SIDES: Final = ((256, 4096), (1024, 8192), (1024, 16384), (4096, 16384))
 """Sides of blocks and of the tasks that go with them in a very large build."""

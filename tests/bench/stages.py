@@ -30,7 +30,7 @@ from affine import Affine
 from numpy.typing import NDArray
 
 from schemas.settings import BuildSettings
-from tiler.build import build_layer
+from tiler.building.build import build_layer
 
 RESULTS: Final = Path(__file__).parent / "results"
 STAGES: Final = ("read_s", "filter_s", "encode_s", "write_s")

@@ -12,7 +12,7 @@ from rasterio.transform import Affine
 from cli.main import run
 from schemas.settings import BuildSettings
 from tests.contract.picture_files import write_with_rasterio
-from tiler.build import build_layer
+from tiler.building.build import build_layer
 
 GOLDEN = Path(__file__).parent / "golden"
 

@@ -21,11 +21,11 @@ from tests.cli.conftest import Clipmap, Golden
 from tests.cli.reports import parsed
 from tests.integration.files import PLACE, settings, tree_digest, write_png, write_tiff
 from tests.reference.terrain import photo
-from tiler import batch
-from tiler.batch import Bounds, run_batch
-from tiler.build import build_layer
-from tiler.batchjobs import Job, explain_death
-from tiler.machine import PROCESS_BYTES
+from tiler.batch import run as batch
+from tiler.batch.jobs import Job, explain_death
+from tiler.batch.run import Bounds, run_batch
+from tiler.building.build import build_layer
+from tiler.estimate.machine import PROCESS_BYTES
 from tiler.stores.dataset import open_dataset
 
 RUN = "import sys; from cli.main import main; sys.argv[0] = 'clipmap'; main()"

@@ -12,7 +12,7 @@ from schemas.errors import InputError
 from schemas.manifest import MANIFEST_NAME
 from tests.cli.conftest import Clipmap
 from tests.s3 import S3Server
-from tiler.diff import diff
+from tiler.checking.diff import diff
 from tiler.stores.dataset import open_dataset
 from viewer.source import DirectorySource
 

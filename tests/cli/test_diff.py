@@ -11,7 +11,7 @@ from schemas.settings import BuildSettings
 from tests.cli.conftest import Clipmap, Golden, Sources
 from tests.cli.reports import parsed
 from tests.unit.tampering import change_samples
-from tiler.build import build_layer
+from tiler.building.build import build_layer
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 from cli.commands.batch import parse_memory
 from cli.jobs import read_jobs
 from schemas.errors import ClipmapError, InputError, NotFoundError, UsageError
-from tiler.batchjobs import Job
+from tiler.batch.jobs import Job
 
 FILES = ("a.tif", "b.tif", "b.tif.aux.xml", "b.tif.ovr", "lone.ovr", "deep/c.tif", "deep/er/a.png", ".hidden.tif")
 

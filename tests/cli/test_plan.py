@@ -15,7 +15,7 @@ from tests.cli.reports import parsed
 from tests.integration.files import write_tiff
 from tests.reference.terrain import photo
 from tests.s3 import S3Server
-from tiler import estimate
+from tiler.estimate import build as estimate
 from tiler.stores.directory import DirectoryStore
 
 REAL = (
@@ -96,7 +96,7 @@ def test_standing_of_what_was_begun_and_ended(cut: tuple[Path, bytes, list[objec
     before = state(tmp_path)
     refused = plan(clipmap, *arguments)["standing"]
     assert refused["act"] == "refuse"
-    assert "the source has changed since; add --update" in refused["sentence"]
+    assert "the source has changed since, or is another file; add --update" in refused["sentence"]
     assert plan(clipmap, *arguments, "--update")["standing"]["act"] == "update"
     assert plan(clipmap, *arguments, "--overwrite")["standing"]["sentence"] == "begin anew, replace the layer"
     assert state(tmp_path) == before
@@ -153,7 +153,7 @@ def test_a_stretch_is_not_sought_again(tmp_path: Path, clipmap: Clipmap, monkeyp
     def refuse(*arguments: object) -> None:
         raise InputError("sought")
 
-    monkeypatch.setattr("tiler.samples.find_ranges", refuse)
+    monkeypatch.setattr("tiler.samples.opening.find_ranges", refuse)
     assert plan(clipmap, *arguments)["standing"]["act"] == "nothing"
 
 

@@ -10,7 +10,7 @@ from schemas.settings import BuildSettings
 from tests.cli.conftest import Clipmap, Golden, Sources
 from tests.cli.reports import parsed
 from tests.unit.tampering import block_path, change_samples
-from tiler.build import build_layer
+from tiler.building.build import build_layer
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from schemas.errors import InputError, NotFoundError, StorageError
 from schemas.manifest import MANIFEST_NAME, Manifest
 from tests.contract.stores import StoreContract
 from tests.server.datasets import publish, write_dataset, write_layer
-from tiler.archive import write_archive
+from tiler.archives.writing import write_archive
 from tiler.stores.archive import ArchiveFileStore, ArchiveStore, unfinished
 from tiler.stores.dataset import open_dataset
 from tiler.stores.directory import DirectoryStore

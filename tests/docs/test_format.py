@@ -15,7 +15,7 @@ from affine import Affine
 from numpy.typing import NDArray
 
 from schemas.settings import BuildSettings
-from tiler.build import build_layer
+from tiler.building.build import build_layer
 
 WIDTH, HEIGHT, BLOCK = 75, 42, 16
 ORIGIN, SPACING_M = (400_000.0, 5_000_000.0), 25.0

@@ -9,7 +9,7 @@ from schemas.address import BlockAddress
 from schemas.errors import InputError
 from tests.integration.files import decode, settings, write_tiff
 from tests.reference.terrain import terrain
-from tiler.build import build_layer
+from tiler.building.build import build_layer
 from tiler.codecs import BlockFormat, open_codec
 from tiler.stores.dataset import open_dataset
 

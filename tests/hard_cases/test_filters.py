@@ -10,13 +10,13 @@ from schemas.region import Rect
 from tests.levels import KINDS, run_cascade
 from tests.reference import kernels as reference_kernels
 from tests.reference import pyramid as reference
-from tiler.cascade import Values
 from tiler.codecs import BlockFormat
-from tiler.cut import round_samples
-from tiler.decimate import coarsen_columns, coarsen_rows
-from tiler.edges import extend
-from tiler.kernels import blackman_sinc
+from tiler.filters.cascade import Values
+from tiler.filters.decimate import coarsen_columns, coarsen_rows
+from tiler.filters.edges import extend
+from tiler.filters.kernels import blackman_sinc
 from tiler.rowfile import RowFile
+from tiler.tasks.cut import round_samples
 
 ROOT = Path(__file__).parents[2]
 UINT8 = BlockFormat("imagery", 16, 1, "uint8")

@@ -7,7 +7,7 @@ import pytest
 
 from tests.integration.files import settings, write_tiff
 from tests.reference.terrain import terrain
-from tiler.build import build_layer
+from tiler.building.build import build_layer
 from tiler.geodesy import ground_spacing_m
 
 STEP = 0.0002777777777777778

@@ -10,8 +10,8 @@ from tests.levels import KINDS, run_cascade
 from tests.reference.kernels import l1_norm, taps
 from tests.reference.pyramid import void_gain_bound
 from tests.reference.terrain import terrain
-from tiler.build import build_layer
-from tiler.cascade import Coverage, Values
+from tiler.building.build import build_layer
+from tiler.filters.cascade import Coverage, Values
 from tiler.stores.dataset import open_dataset
 
 Pair = tuple[Values, Coverage]

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from schemas.settings import BuildSettings
-from tiler.build import build_layer
+from tiler.building.build import build_layer
 from tiler.stores.directory import DirectoryStore
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from tests.integration.files import Picture, assemble, settings, write_tiff
 from tests.reference.terrain import photo, terrain
-from tiler.build import build_layer
+from tiler.building.build import build_layer
 from tiler.export import ExportReport, ExportSettings, export
 from tiler.stores.dataset import Dataset, open_dataset
 

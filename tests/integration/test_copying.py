@@ -18,14 +18,14 @@ from schemas.findings import Finding
 from schemas.manifest import MANIFEST_NAME, Patch, digest, pack_bitmap
 from tests.integration.files import tree_digest
 from tests.server.datasets import block_bytes, publish, write_dataset, write_layer
-from tiler.copying import copy_dataset
-from tiler.diff import diff
+from tiler.archives.copying import copy_dataset
+from tiler.checking.diff import diff
+from tiler.checking.verify import Checks, verify
 from tiler.stores import Store
 from tiler.stores.archive import ArchiveStore
 from tiler.stores.dataset import open_dataset, read_manifest
 from tiler.stores.directory import DirectoryStore
 from tiler.stores.locate import open_store
-from tiler.verify import Checks, verify
 
 BLANK = BlockAddress(0, 1, 2)
 PATCHED = (BlockAddress(0, 0, 0), BlockAddress(1, 2, 1))
@@ -271,7 +271,7 @@ def test_what_a_build_left_unfinished_is_not_thrown_away(archive: bool, source: 
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from tiler.copying import copy_dataset
+from tiler.archives.copying import copy_dataset
 from tiler.stores.archive import ArchiveStore
 from tiler.stores.dataset import open_dataset
 source, target, archive, moment = sys.argv[1:]

@@ -14,9 +14,9 @@ from schemas.errors import InputError, NotFoundError, StorageError
 from schemas.manifest import MANIFEST_NAME
 from tests.integration.files import settings, tree_digest, write_tiff
 from tests.reference.terrain import photo
-from tiler.build import build_layer
+from tiler.building.build import build_layer
+from tiler.checking.verify import verify
 from tiler.stores.dataset import open_dataset
-from tiler.verify import verify
 
 OPTIONS = {"codec": "png", "block": 32, "task": 128, "pad": 1}
 

@@ -13,7 +13,7 @@ from tests.contract.picture_files import write_with_openimageio
 from tests.contract.plain_tiff import MIN_IS_BLACK, RGB, tiff_bytes
 from tests.integration.files import Picture, assemble, settings, tree_digest, write_tiff
 from tests.reference.terrain import photo, terrain
-from tiler.build import build_layer
+from tiler.building.build import build_layer
 from tiler.stores.dataset import open_dataset
 
 
@@ -90,7 +90,7 @@ def test_mistakes_leave_nothing_and_cost_no_pass_over_the_file(tmp_path: Path, m
     path = write_tiff(tmp_path / "scene.tif", scene(60, 60))
     built(path, tmp_path / "out", stretch="2%")
     before = tree_digest(tmp_path / "out")
-    monkeypatch.setattr("tiler.samples.find_ranges", None)
+    monkeypatch.setattr("tiler.samples.opening.find_ranges", None)
     mistakes: list[tuple[dict[str, Any], str]] = [
         ({"stretch": "3%"}, r"other settings \(stretch was 2%, now 3%\); add --overwrite"),
         ({"stretch": "2", "overwrite": True}, "expected CUT%"),

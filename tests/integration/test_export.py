@@ -21,7 +21,7 @@ from schemas.region import Rect
 from tests.integration.export_datasets import build, exported, the_layer
 from tests.integration.files import settings, tree_digest, write_tiff
 from tests.reference.terrain import photo, terrain
-from tiler.build import build_layer
+from tiler.building.build import build_layer
 from tiler.export import FORMS
 from tiler.export.pyramid import Pyramid, in_order, tile_count, tiles
 from tiler.stores.dataset import open_dataset

@@ -137,7 +137,7 @@ def test_it_lies_where_the_source_lay(kind: str, folder: Path) -> None:
 def test_a_turned_layer_and_one_in_degrees_keep_their_places(tmp_path: Path) -> None:
     from tests.integration.files import settings, write_tiff
     from tests.reference.terrain import terrain
-    from tiler.build import build_layer
+    from tiler.building.build import build_layer
 
     pixels = terrain(40, 50, seed=1).astype(np.float32)
     turned = Affine.translation(500_000, 5_000_000) @ Affine.rotation(30) @ Affine.scale(10, -10)
@@ -249,7 +249,7 @@ def test_the_validators_command_agrees(folder: Path) -> None:
 def test_it_builds_back_into_the_same_dataset(folder: Path, tmp_path: Path) -> None:
     """What the file says of place, registration, voids and values is all a build needs."""
     from tests.integration.files import settings
-    from tiler.build import build_layer
+    from tiler.building.build import build_layer
 
     dataset = open_dataset(build("raw_heights_pad", folder))
     exported(folder / "raw_heights_pad" / "out", "cog", tmp_path / "back.tif")

@@ -153,7 +153,7 @@ def test_blank_blocks_are_transparent(folder: Path) -> None:
 
 def test_the_single_pixel_is_the_mean(tmp_path: Path) -> None:
     from tests.integration.files import settings
-    from tiler.build import build_layer
+    from tiler.building.build import build_layer
 
     write_png(tmp_path / "flat.png", np.full((70, 50, 3), (10, 200, 77), np.uint8))
     build_layer([tmp_path / "flat.png"], tmp_path / "out", settings(codec="png"))
@@ -251,7 +251,7 @@ def test_other_codecs_become_png(folder: Path) -> None:
 
 def test_a_photo_of_one_block(tmp_path: Path) -> None:
     from tests.integration.files import settings
-    from tiler.build import build_layer
+    from tiler.building.build import build_layer
 
     write_png(tmp_path / "one.png", photo(20, 31, seed=1))
     build_layer([tmp_path / "one.png"], tmp_path / "out", settings(codec="png"))

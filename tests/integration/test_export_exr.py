@@ -189,7 +189,7 @@ def test_the_bytes_do_not_depend_on_workers_or_time(folder: Path) -> None:
 
 def test_half_floats_are_refused_where_they_end(tmp_path: Path) -> None:
     from tests.integration.files import settings, write_tiff
-    from tiler.build import build_layer
+    from tiler.building.build import build_layer
 
     source = write_tiff(tmp_path / "high.tif", np.full((20, 20, 1), 70_000, np.float32))
     build_layer([source], tmp_path / "out", settings())

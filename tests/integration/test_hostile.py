@@ -14,8 +14,8 @@ from schemas.lattice import Lattice
 from schemas.settings import BuildSettings
 from tests.integration.files import write_png
 from tests.reference.terrain import photo
-from tiler.build import build_layer
-from tiler.tasks import plan_tasks, plan_tiers
+from tiler.building.build import build_layer
+from tiler.tasks.partition import plan_tasks, plan_tiers
 
 LAYOUT_TAGS = {"tile": (322, 323, 324, 325), "strip": (278, None, 273, 279)}
 

@@ -20,10 +20,10 @@ from schemas.errors import InputError, NotFoundError, StorageError, UsageError
 from schemas.manifest import MANIFEST_NAME
 from tests.integration.files import assemble, opened, settings, tree_digest, write_tiff
 from tests.reference.terrain import photo
-from tiler.build import build_layer
+from tiler.building.build import build_layer
+from tiler.checking.verify import verify
 from tiler.stores.dataset import open_dataset
 from tiler.stores.directory import DirectoryStore
-from tiler.verify import verify
 
 
 def test_an_existing_layer_is_replaced_only_when_told(height_tiff: Path, tmp_path: Path) -> None:

@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-import tiler.overlap
+import tiler.tasks.overlap
 from schemas.errors import InputError, StorageError, UsageError
 from schemas.manifest import MANIFEST_NAME, Patch, parse_manifest
 from tests.integration.files import Picture, settings, tree_digest, write_png, write_tiff
 from tests.reference.terrain import photo
-from tiler.build import build_layer
-from tiler.diff import diff
-from tiler.repair import verify_and_repair
+from tiler.building.build import build_layer
+from tiler.checking.diff import diff
+from tiler.checking.repair import verify_and_repair
+from tiler.checking.verify import Checks, verify
 from tiler.stores.dataset import open_dataset
 from tiler.stores.directory import DirectoryStore
-from tiler.verify import Checks, verify
 
 OPTIONS: dict[str, Any] = {"codec": "png", "block": 32, "task": 128}
 
@@ -79,7 +79,7 @@ def test_another_file_with_the_same_size_and_time_is_noticed(tmp_path: Path) -> 
 
 def test_many_lost_pieces_of_an_object_store_are_made_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """They were made on the threads that read, which then waited for themselves."""
-    monkeypatch.setattr(tiler.overlap, "is_remote", lambda location: True)
+    monkeypatch.setattr(tiler.tasks.overlap, "is_remote", lambda location: True)
     source, out = write_tiff(tmp_path / "photo.tif", photo(1000, 1000)), tmp_path / "out"
     build_layer(source, out, settings(codec="png", block=8, task=32, workers=2))
     whole = tree_digest(out)
@@ -249,7 +249,7 @@ def test_files_of_others_beside_the_blocks_are_never_deleted(tmp_path: Path) -> 
 
 
 def test_many_updates_are_put_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tiler.publish._MANY_PATCHES", 3)
+    monkeypatch.setattr("tiler.building.publish._MANY_PATCHES", 3)
     pixels = photo(300, 300)
     source, out = changed(tmp_path / "photo.tif", pixels, 1), tmp_path / "out"
     build_layer(source, out, settings(**OPTIONS))

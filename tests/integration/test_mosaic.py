@@ -18,7 +18,7 @@ from schemas.settings import MAX_SAMPLES, BuildSettings
 from tests.integration.files import assemble
 from tests.reference.terrain import terrain
 from tests.unit.mosaic_files import quarters, write
-from tiler.build import build_layer
+from tiler.building.build import build_layer
 from tiler.sources import Reader
 from tiler.sources.convert import Source, choose_conversion
 from tiler.sources.files import open_file

@@ -17,13 +17,13 @@ from cli.main import run
 from schemas.errors import StorageError
 from tests.integration.files import settings
 from tests.s3 import S3Server
-from tiler.build import build_layer
-from tiler.diff import diff
+from tiler.building.build import build_layer
+from tiler.checking.diff import diff
+from tiler.checking.verify import verify
 from tiler.stores import locate
 from tiler.stores.dataset import open_dataset
 from tiler.stores.objectlock import LockTimes
 from tiler.stores.objects import ObjectStore
-from tiler.verify import verify
 
 QUICK = LockTimes(refresh_s=0.2, stale_s=2.0, watch_s=0.7)
 
@@ -108,7 +108,7 @@ from functools import partial
 from pathlib import Path
 from schemas.errors import ClipmapError
 from tests.integration.files import settings
-from tiler.build import build_layer
+from tiler.building.build import build_layer
 from tiler.stores import locate
 from tiler.stores.objectlock import LockTimes
 from tiler.stores.objects import ObjectStore

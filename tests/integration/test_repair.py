@@ -14,10 +14,10 @@ from schemas.errors import StorageError
 from schemas.findings import VerifyReport
 from tests.integration.files import settings, tree_digest, write_tiff
 from tests.reference.terrain import photo
-from tiler.build import build_layer
-from tiler.repair import verify_and_repair
+from tiler.building.build import build_layer
+from tiler.checking.repair import verify_and_repair
+from tiler.checking.verify import Checks, verify
 from tiler.stores.dataset import open_dataset
-from tiler.verify import Checks, verify
 
 OPTIONS = {"codec": "png", "task": 128, "pad": 2}
 

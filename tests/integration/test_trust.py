@@ -8,9 +8,9 @@ import pytest
 from schemas.settings import BuildSettings
 from tests.integration.files import assemble, settings, write_tiff
 from tests.reference.terrain import terrain
-from tiler.build import build_layer
+from tiler.building.build import build_layer
+from tiler.checking.verify import Checks, verify
 from tiler.stores.dataset import open_dataset
-from tiler.verify import Checks, verify
 
 
 @pytest.mark.parametrize(

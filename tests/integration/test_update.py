@@ -18,11 +18,11 @@ from schemas.manifest import Layer
 from schemas.region import Rect
 from tests.integration.files import Picture, settings, write_tiff
 from tests.reference.terrain import photo
-from tiler.build import build_layer
-from tiler.diff import diff
-from tiler.kernels import DESIGNS
+from tiler.building.build import build_layer
+from tiler.checking.diff import diff
+from tiler.checking.verify import verify
+from tiler.filters.kernels import DESIGNS
 from tiler.stores.dataset import Dataset, open_dataset
-from tiler.verify import verify
 
 SIDE = 600
 
@@ -171,6 +171,9 @@ def test_without_records_nothing_can_be_updated(tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("tasks"))
     with pytest.raises(UsageError, match="no records of how it was built; add --overwrite"):
         build_layer(source, tmp_path / "out", settings(update=True))
+    build_layer(source, tmp_path / "other", settings())
+    assert build_layer(source, tmp_path / "other", settings(records=False)).outcome == "up to date"
+    assert not list(tmp_path.rglob("tasks"))
 
 
 def test_a_source_that_changes_while_it_is_read_is_not_published(tmp_path: Path) -> None:

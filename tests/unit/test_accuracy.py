@@ -27,8 +27,8 @@ from tiler.accuracy.precision import measure_precision
 from tiler.accuracy.response import figures
 from tiler.accuracy.sample import Sample, built_in
 from tiler.accuracy.voids import measure_voids
-from tiler.edges import EdgeRule
-from tiler.kernels import DESIGNS, blackman_sinc
+from tiler.filters.edges import EdgeRule
+from tiler.filters.kernels import DESIGNS, blackman_sinc
 
 Array = NDArray[np.float64]
 KINDS: tuple[LayerKind, ...] = ("height", "imagery")

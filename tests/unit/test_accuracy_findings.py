@@ -18,7 +18,7 @@ from tiler.accuracy.findings import dominating, findings, frontier
 from tiler.accuracy.response import Figures
 from tiler.accuracy.sample import EDGE, REGISTRATION, Sample, largest_covered_square, load_sample
 from tiler.accuracy.voids import VoidResult
-from tiler.build import build_layer
+from tiler.building.build import build_layer
 
 
 def heights(side: int) -> Sample:

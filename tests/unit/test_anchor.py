@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from schemas.settings import BuildSettings
 from tiler.accuracy.experiments import run_cascade
-from tiler.kernels import Kernel, blackman_sinc, box
+from tiler.filters.kernels import Kernel, blackman_sinc, box
 from tiler.sources.convert import Source, choose_conversion
 from tiler.sources.files import open_file
 

@@ -14,9 +14,9 @@ from schemas.findings import DiffReport, LayerDifference
 from tests.integration.files import assemble, settings, write_tiff
 from tests.reference.terrain import photo, terrain
 from tests.unit.tampering import block_path, change_samples, edit_layer
-from tiler.build import build_layer
+from tiler.building.build import build_layer
+from tiler.checking.diff import diff, field_differences
 from tiler.codecs import Mask, Samples
-from tiler.diff import diff, field_differences
 from tiler.stores.dataset import open_dataset
 
 PROVENANCE = {"source.file_bytes", "source.name"}

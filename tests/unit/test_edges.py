@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tiler.edges import EdgeRule, extend
+from tiler.filters.edges import EdgeRule, extend
 
 Line = NDArray[np.float64]
 

@@ -19,8 +19,8 @@ from schemas.errors import MissingExtraError, UsageError
 from schemas.region import Rect
 from tests.integration.files import assemble, settings, tree_digest, write_tiff
 from tests.reference.terrain import photo, power_law_field
-from tiler.build import build_layer
-from tiler.enhance import REACH, EnhancedSource, Enhancement, parse_enhancement
+from tiler.building.build import build_layer
+from tiler.samples.enhance import REACH, EnhancedSource, Enhancement, parse_enhancement
 from tiler.sources import FileInfo
 from tiler.sources.convert import Conversion
 from tiler.stores.dataset import open_dataset

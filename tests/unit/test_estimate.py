@@ -16,13 +16,14 @@ from schemas.estimates import BuildEstimate
 from schemas.lattice import Lattice
 from tests.integration.files import settings, write_png, write_tiff
 from tests.reference.terrain import photo
-from tiler import estimate, trial
-from tiler.build import BuildReport, build_layer
-from tiler.estimate import estimate_build, plan_from_headers
-from tiler.memory import task_windows
-from tiler.plan import Plan, plan_layer
-from tiler.samples import open_headers
-from tiler.tasks import Tier
+from tiler.building.build import BuildReport, build_layer
+from tiler.building.plan import Plan, plan_layer
+from tiler.estimate import build as estimate
+from tiler.estimate import trial
+from tiler.estimate.build import estimate_build, plan_from_headers
+from tiler.estimate.memory import task_windows
+from tiler.samples.opening import open_headers
+from tiler.tasks.partition import Tier
 
 SIDE = 1024
 

@@ -14,12 +14,12 @@ from schemas.errors import UsageError
 from schemas.region import Rect
 from tests.integration.files import assemble, settings, write_tiff
 from tests.reference.terrain import terrain
-from tiler.build import build_layer
-from tiler.fill import FilledSource
+from tiler.building.build import build_layer
+from tiler.samples.fill import FilledSource
+from tiler.samples.transfer import LinearLight, encode_srgb, light_of_codes
 from tiler.sources import FileInfo
 from tiler.sources.convert import Conversion
 from tiler.stores.dataset import open_dataset
-from tiler.transfer import LinearLight, encode_srgb, light_of_codes
 
 Float32 = NDArray[np.float32]
 

@@ -8,7 +8,7 @@ from schemas.facts import Footprint
 from schemas.lattice import Registration
 from schemas.manifest import Layer, Transform
 from tests.schemas.sample_manifest import make_manifest
-from tiler.footprint import measure_footprint
+from tiler.inspecting.footprint import measure_footprint
 
 EARTH_M2 = 510_065_621_724_089
 """Area of the WGS 84 ellipsoid (GeographicLib)."""

@@ -12,14 +12,14 @@ import pytest
 from schemas.errors import ClipmapError, InputError, StorageError, UsageError
 from tests.integration.files import settings, tree_digest, write_tiff
 from tests.reference.terrain import photo
-from tiler.build import build_layer
-from tiler.engine import LocalEngine
-from tiler.job import JobRef, open_job
-from tiler.jobworker import Failed, TaskCall, leave_job, retire_jobs, run_task
-from tiler.ledger import Ledger
-from tiler.records import RecordBook
+from tiler.building.build import build_layer
+from tiler.cluster.job import JobRef, open_job
+from tiler.cluster.worker import Failed, TaskCall, leave_job, retire_jobs, run_task
 from tiler.stores.directory import DirectoryStore
-from tiler.worker import Done, TaskWorker, Work
+from tiler.tasks.engine import LocalEngine
+from tiler.tasks.ledger import Ledger
+from tiler.tasks.records import RecordBook
+from tiler.tasks.worker import Done, TaskWorker, Work
 
 OPTIONS = {"codec": "png", "task": 64}
 
@@ -191,6 +191,6 @@ def test_freed_memory_is_kept_where_the_nanny_has_it_given_back(
         monkeypatch.delenv("MALLOC_TRIM_THRESHOLD_", raising=False)
     else:
         monkeypatch.setenv("MALLOC_TRIM_THRESHOLD_", given)
-    monkeypatch.setattr("tiler.jobworker.ctypes.CDLL", Library)
+    monkeypatch.setattr("tiler.cluster.worker.ctypes.CDLL", Library)
     build_layer(source, tmp_path / "out", settings(**OPTIONS), engine=Visitor())
     assert calls == expected

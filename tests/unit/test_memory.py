@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from schemas.settings import BuildSettings
 from tests.integration.files import write_tiff
 from tests.reference.terrain import photo
-from tiler.estimate import plan_from_headers
-from tiler.machine import available_bytes
-from tiler.memory import build_memory_bytes
-from tiler.plan import Plan
+from tiler.building.plan import Plan
+from tiler.estimate.build import plan_from_headers
+from tiler.estimate.machine import available_bytes
+from tiler.estimate.memory import build_memory_bytes
 
 BUILD = "import sys; from cli.main import run; sys.exit(run(sys.argv[1:]))"
 MIB = 1 << 20

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from schemas.errors import StorageError
-from tiler.overlap import TaskWrites, read_all
 from tiler.stores.directory import DirectoryStore
+from tiler.tasks.overlap import TaskWrites, read_all
 
 
 class SlowStore(DirectoryStore):

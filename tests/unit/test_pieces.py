@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from schemas.lattice import Lattice
 from schemas.manifest import digest
 from schemas.region import Rect
-from tiler.pieces import PieceReader, PieceRef, PieceWriter
-from tiler.tasks import Task, plan_tasks, plan_tiers
+from tiler.tasks.partition import Task, plan_tasks, plan_tiers
+from tiler.tasks.pieces import PieceReader, PieceRef, PieceWriter
 
 
 @given(

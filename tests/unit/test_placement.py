@@ -11,7 +11,7 @@ from schemas.errors import UsageError
 from schemas.lattice import Registration
 from schemas.manifest import Manifest, Transform, World
 from tests.schemas.sample_manifest import make_layer
-from tiler.placement import place
+from tiler.building.placement import place
 from tiler.sources import FileInfo, Georeference
 
 UTM = Georeference("EPSG:32618", "metre", (30.0, 0.0, 500000.0, 0.0, -30.0, 4000000.0))

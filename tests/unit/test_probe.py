@@ -15,10 +15,10 @@ from schemas.facts import PointFacts
 from tests.integration.files import assemble, settings, write_png, write_tiff
 from tests.reference.terrain import photo, terrain
 from tests.unit.tampering import block_path, edit_layer, manifest_of
-from tiler.build import build_layer
-from tiler.inspection import describe_block, describe_level
-from tiler.preview import preview_png
-from tiler.probe import probe_geographic, probe_pixel, probe_world
+from tiler.building.build import build_layer
+from tiler.inspecting.facts import describe_block, describe_level
+from tiler.inspecting.preview import preview_png
+from tiler.inspecting.probe import probe_geographic, probe_pixel, probe_world
 from tiler.stores.dataset import open_dataset
 
 ORIGIN, STEP = (500_000.0, 5_000_000.0), 10.0

@@ -10,7 +10,7 @@ import pytest
 from schemas.errors import InputError
 from schemas.region import Rect
 from tiler.sources import FileInfo, Part
-from tiler.stamps import SourceStamps, stamp_file
+from tiler.tasks.stamps import SourceStamps, stamp_file
 
 
 @pytest.fixture

@@ -13,9 +13,9 @@ from schemas.errors import InputError, UsageError
 from schemas.region import Rect
 from schemas.settings import BuildSettings
 from tests.unit.memory_reader import MemoryReader
-from tiler import stretch as subject
+from tiler.samples import stretch as subject
+from tiler.samples.stretch import StretchedSource, find_ranges, parse_stretch
 from tiler.sources.convert import Source, choose_conversion
-from tiler.stretch import StretchedSource, find_ranges, parse_stretch
 
 
 def opened(pixels: NDArray[Any], mask: NDArray[np.uint8] | None = None, **declared: Any) -> Source:

@@ -11,7 +11,7 @@ from schemas.address import BlockAddress
 from schemas.lattice import Lattice
 from schemas.region import Rect
 from tiler.sources import Layout
-from tiler.tasks import choose_task_side, count_tasks, plan_block_task, plan_tasks, plan_tiers
+from tiler.tasks.partition import choose_task_side, count_tasks, plan_block_task, plan_tasks, plan_tiers
 
 SIZES = st.integers(1, 3000)
 LAYOUTS: tuple[Layout, ...] = ("tiled", "striped")

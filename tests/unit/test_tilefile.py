@@ -31,11 +31,11 @@ from schemas.address import BlockAddress
 from schemas.errors import ClipmapError, InputError, NotFoundError, StorageError
 from tests.integration.memory_datasets import memory_dataset
 from tests.server.datasets import block_bytes
-from tiler.archive import write_archive
+from tiler.archives.tileids import tile_ids
+from tiler.archives.writing import write_archive
 from tiler.stores.archive import ArchiveFileStore
 from tiler.stores.dataset import open_dataset
 from tiler.stores.tilefile import TileFile
-from tiler.tileids import tile_ids
 
 U64 = (1 << 64) - 1
 Change = Callable[[dict[str, Any]], None]

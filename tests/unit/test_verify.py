@@ -23,12 +23,12 @@ from tests.unit.tampering import (
     record_of,
     replace_bytes,
 )
-from tiler import verify as verify_module
-from tiler.build import build_layer
+from tiler.building.build import build_layer
+from tiler.checking import verify as verify_module
+from tiler.checking.verify import Checks, verify
 from tiler.codecs import Mask, Samples
 from tiler.stores.dataset import Dataset, open_dataset
 from tiler.stores.directory import DirectoryStore
-from tiler.verify import Checks, verify
 
 PAD = 2
 SEAMS = Checks(seams=True, workers=2)

@@ -17,9 +17,9 @@ from tiler.accuracy import plain, rivals
 from tiler.accuracy.ideal import band_limited, ideal_level, interior, predicted_errors
 from tiler.accuracy.response import Figures, figures
 from tiler.accuracy.sample import DEFAULT_RADIUS, EXPONENT, RMS_M, Sample
-from tiler.cascade import Cascade, Coverage, Recipe, Values, halve
-from tiler.edges import EdgeRule
-from tiler.kernels import DESIGNS, FIXED_RADIUS, Kernel, frequency_response
+from tiler.filters.cascade import Cascade, Coverage, Recipe, Values, halve
+from tiler.filters.edges import EdgeRule
+from tiler.filters.kernels import DESIGNS, FIXED_RADIUS, Kernel, frequency_response
 
 Array = NDArray[np.float64]
 Maker = Literal["clipmap", "numpy", "openimageio"]

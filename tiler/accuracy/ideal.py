@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.lattice import Registration
-from tiler.edges import EdgeRule
+from tiler.filters.edges import EdgeRule
 
 Array = NDArray[np.float64]
 Scalar = TypeVar("Scalar", bound=np.generic)

@@ -7,8 +7,8 @@ float32 it shows what the differences are for.
 import numpy as np
 from numpy.typing import NDArray
 
-from tiler.edges import EdgeRule
-from tiler.kernels import Kernel
+from tiler.filters.edges import EdgeRule
+from tiler.filters.kernels import Kernel
 
 Samples = NDArray[np.floating]
 

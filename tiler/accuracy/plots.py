@@ -13,7 +13,7 @@ from tiler.accuracy.findings import default_of, frontier
 from tiler.accuracy.ideal import ideal_level, interior
 from tiler.accuracy.sample import Sample
 from tiler.accuracy.voids import VoidResult
-from tiler.kernels import frequency_response
+from tiler.filters.kernels import frequency_response
 
 _COLOURS: Final = {"blackman-sinc": "#c2410c", "kaiser": "#1d6fa5", "lanczos": "#2f7d4f", "box": "#6b4fa0", "triangle": "#6b4fa0"}
 _SINCS: Final = ("blackman-sinc", "kaiser", "lanczos")

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tiler.kernels import Kernel, frequency_response
+from tiler.filters.kernels import Kernel, frequency_response
 
 _FLOOR = 1e-10
 """Gains below this are shown as -200 dB: the taps are multiples of 2**-23, so a deeper stopband is chance."""

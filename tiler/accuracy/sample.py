@@ -14,7 +14,7 @@ from schemas.manifest import LayerKind
 from schemas.region import Rect
 from schemas.settings import BuildSettings
 from tiler.accuracy.ideal import MARGIN, power_law_terrain
-from tiler.edges import EdgeRule
+from tiler.filters.edges import EdgeRule
 from tiler.sources.convert import Source, choose_conversion
 from tiler.sources.files import open_file
 

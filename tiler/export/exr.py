@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from schemas.errors import StorageError, UsageError
 from schemas.manifest import Layer, Manifest
 from schemas.region import Rect
-from tiler.blockreader import DecodedBlock
+from tiler.checking.blockreader import DecodedBlock
 from tiler.export import Exported, Job
 from tiler.export.geotags import filter_text
 from tiler.export.pyramid import Pyramid, in_order, tile_count, tiles
 from tiler.export.staging import staged
+from tiler.samples.transfer import light_of_codes
 from tiler.stores.dataset import Dataset
-from tiler.transfer import light_of_codes
 
 Pixels = NDArray[np.float32]
 

@@ -14,13 +14,13 @@ import numpy as np
 from schemas.address import BlockAddress
 from schemas.errors import InputError
 from schemas.region import Rect, blocks_in
-from tiler.blockreader import BlockReader, DecodedBlock
-from tiler.cascade import Cascade, Coverage, Recipe, Values, halve, held_windows
-from tiler.checkedread import read_block
-from tiler.cut import round_samples
-from tiler.kernels import DESIGNS
+from tiler.checking.blockreader import BlockReader, DecodedBlock
+from tiler.checking.checkedread import read_block
+from tiler.filters.cascade import Cascade, Coverage, Recipe, Values, halve, held_windows
+from tiler.filters.kernels import DESIGNS
+from tiler.samples.transfer import light_of_codes
 from tiler.stores.dataset import Dataset
-from tiler.transfer import light_of_codes
+from tiler.tasks.cut import round_samples
 
 _QUEUED_PER_WORKER: Final = 2
 """Finished tiles that may wait for a slower one before them: enough to keep workers busy, and what bounds the memory."""

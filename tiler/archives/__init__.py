@@ -1,0 +1,1 @@
+"""Layers as PMTiles archives, and copies of datasets between stores."""

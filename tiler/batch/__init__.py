@@ -1,0 +1,1 @@
+"""Many builds with one command, in processes of their own."""

@@ -1,0 +1,1 @@
+"""Whether datasets hold what they claim, how they differ, and making damage good."""

@@ -1,0 +1,1 @@
+"""What a dataset, a level, a block or a place holds."""

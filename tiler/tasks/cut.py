@@ -1,0 +1,228 @@
+"""From rows of a level to stored blocks: round once, cut, pad, measure, encode, store."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.address import BlockAddress
+from schemas.blockindex import BLANK, BlockRecord
+from schemas.errors import InputError
+from schemas.lattice import Lattice
+from schemas.manifest import digest
+from schemas.region import Rect
+from tiler.codecs import BlockFormat, Codec, Mask, Samples
+from tiler.filters.cascade import Coverage, Values
+from tiler.samples.transfer import encode_srgb
+from tiler.stores import Store
+from tiler.tasks.destination import Destination
+from tiler.tasks.measure import measure
+from tiler.tasks.overlap import TaskWrites
+
+
+@dataclass(slots=True)
+class StageTimes:
+    """Seconds of thread time spent per stage."""
+
+    read_s: float = 0.0
+    filter_s: float = 0.0
+    encode_s: float = 0.0
+    write_s: float = 0.0
+
+    def add(self, other: "StageTimes") -> None:
+        """Add the seconds of another part of the build."""
+        self.read_s += other.read_s
+        self.filter_s += other.filter_s
+        self.encode_s += other.encode_s
+        self.write_s += other.write_s
+
+
+@dataclass(frozen=True, slots=True)
+class CutBlock:
+    """What became of one block; ``minima``, ``maxima`` and ``sums`` are per colour channel over its valid samples."""
+
+    address: BlockAddress
+    record: BlockRecord
+    minima: tuple[float, ...]
+    maxima: tuple[float, ...]
+    sums: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """Where the blocks of a layer go and in what form."""
+
+    store: Store
+    destination: Destination
+    lattice: Lattice
+    block: BlockFormat
+    codec: Codec
+    linear_light: bool = False
+
+
+def round_samples(values: Values, coverage: Coverage | None, block: BlockFormat, linear_light: bool = False) -> tuple[Samples, Mask | None]:
+    """Round float32 ``values`` (rows, columns, channels) to the stored type, once, to nearest (ties to even), within its range.
+
+    Coverage becomes the alpha channel of imagery, or the mask of heights (True where any of the sample is covered). Colour
+    under an alpha of 0 is set to 0. Values in ``linear_light`` are encoded as sRGB first.
+    """
+    if block.dtype == "float32":
+        return values, None if coverage is None else coverage > 0
+    dtype = np.dtype(block.dtype)
+    top = np.iinfo(dtype).max
+    codes = encode_srgb(values, top) if linear_light else values
+    rounded = np.clip(np.rint(codes), 0, top).astype(dtype)
+    if not block.alpha:
+        return rounded, None
+    alpha = np.full(values.shape[:2], top, dtype) if coverage is None else np.rint(coverage * np.float32(top)).astype(dtype)
+    rounded[alpha == 0] = 0
+    return np.concatenate([rounded, alpha[..., np.newaxis]], axis=-1), None
+
+
+@dataclass(slots=True)
+class _Strip:
+    """Rounded rows of a level, from row ``top`` on, that wait for the block row ``block_y`` to be complete."""
+
+    top: int
+    block_y: int
+    samples: list[Samples] = field(default_factory=list)
+    masks: list[Mask] = field(default_factory=list)
+    rows: int = 0
+
+    def append(self, samples: Samples, mask: Mask | None) -> None:
+        """Add rows at the bottom."""
+        self.samples.append(samples)
+        if mask is not None:
+            self.masks.append(mask)
+        self.rows += len(samples)
+
+    def joined(self) -> tuple[Samples, Mask | None]:
+        """Return all rows in one piece."""
+        if len(self.samples) > 1:
+            self.samples = [np.concatenate(self.samples)]
+            self.masks = [np.concatenate(self.masks)] if self.masks else []
+        return self.samples[0], self.masks[0] if self.masks else None
+
+    def drop_above(self, y: int) -> None:
+        """Forget the rows above ``y``."""
+        samples, mask = self.joined()
+        gone = max(0, y - self.top)
+        self.samples = [samples[gone:]]
+        self.masks = [] if mask is None else [mask[gone:]]
+        self.top, self.rows = self.top + gone, self.rows - gone
+
+
+class Cutter:
+    """Takes the rows a cascade emits for one task and stores the blocks of its levels.
+
+    ``core`` are the task's samples of level ``first_level``; rows and columns beyond it and its pad (the halo) are dropped.
+    ``on_block`` is called once per finished block; ``written`` counts those whose bytes were stored. After the
+    last rows ``finish`` must be called: until then blocks may be on their way.
+    """
+
+    def __init__(self, target: Target, first_level: int, core: Rect, on_block: Callable[[CutBlock], None]) -> None:
+        self.times = StageTimes()
+        self.written = 0
+        self._target = target
+        self._first_level = first_level
+        self._core = core
+        self._on_block = on_block
+        self._strips: dict[int, _Strip] = {}
+        self._writes = TaskWrites(target.store)
+
+    def finish(self) -> None:
+        """Return when all blocks are stored; raises StorageError if one could not be."""
+        started = perf_counter()
+        self._writes.finish()
+        self.times.write_s += perf_counter() - started
+
+    def take(self, level: int, first: int, values: Values, coverage: Coverage | None, left: int) -> None:
+        """Take rows ``first`` and following of ``level``, whose first column is ``left``."""
+        lattice = self._target.lattice
+        core = self._core.coarsened(level - self._first_level)
+        padded = core.grown(lattice.pad) & lattice.level_rect(level)
+        rows, columns = slice(max(padded.y0 - first, 0), max(padded.y1 - first, 0)), slice(padded.x0 - left, padded.x1 - left)
+        part, covered = values[rows, columns], None if coverage is None else coverage[rows, columns]
+        if not len(part):
+            return
+        strip = self._strips.get(level)
+        if strip is None:
+            strip = self._strips[level] = _Strip(padded.y0, core.y0 // lattice.block)
+        strip.append(*round_samples(part, covered, self._target.block, self._target.linear_light))
+        self._cut_complete(level, strip, core, padded)
+
+    def _cut_complete(self, level: int, strip: _Strip, core: Rect, padded: Rect) -> None:
+        block, pad = self._target.lattice.block, self._target.lattice.pad
+        while strip.block_y * block < core.y1 and strip.top + strip.rows >= min((strip.block_y + 1) * block + pad, padded.y1):
+            samples, mask = strip.joined()
+            for x in range(core.x0 // block, -(-core.x1 // block)):
+                address = BlockAddress(level, x, strip.block_y)
+                seen = self._target.lattice.core(address).grown(pad) & padded
+                window = np.s_[seen.y0 - strip.top : seen.y1 - strip.top, seen.x0 - padded.x0 : seen.x1 - padded.x0]
+                self._on_block(self._finish(address, seen, samples[window], None if mask is None else mask[window]))
+            strip.block_y += 1
+            strip.drop_above(strip.block_y * block - pad)
+
+    def _finish(self, address: BlockAddress, seen: Rect, samples: Samples, mask: Mask | None) -> CutBlock:
+        """Measure the core, encode core and pad, store; ``samples`` are those of ``seen``, what of the padded block the level has."""
+        target = self._target
+        own = target.lattice.valid_core(address).shifted(-seen.x0, -seen.y0)
+        core = np.s_[own.y0 : own.y1, own.x0 : own.x1]
+        if address.level and target.codec.value_range is not None:
+            # What the filter overshot is clipped; it is measured as readers will see it.
+            lowest, highest = target.codec.value_range
+            samples = np.clip(samples, np.float32(lowest), np.float32(highest))
+        valid = samples[core][..., -1] > 0 if target.block.alpha else None if mask is None else mask[core]
+        count, (minima, maxima, sums) = measure(samples[core], valid, samples.shape[-1] - target.block.alpha)
+        if not count:
+            return CutBlock(address, BLANK, (), (), ())
+        low, high = float(minima.min()), float(maxima.max())
+        if address.level == 0:
+            self._check_range(address, low, high)
+        started = perf_counter()
+        whole = target.lattice.core(address).grown(target.lattice.pad)
+        data = target.codec.encode(*_completed(samples, mask, seen, whole, target.block))
+        encoded = perf_counter()
+        record = BlockRecord(digest(data), len(data), count, low, high)
+        key = target.destination.key(address, record)
+        if key is not None:
+            self._writes.write(key, data)
+            self.written += 1
+        self.times.encode_s += encoded - started
+        self.times.write_s += perf_counter() - encoded
+        return CutBlock(address, record, _floats(minima), _floats(maxima), _floats(sums))
+
+    def _check_range(self, address: BlockAddress, low: float, high: float) -> None:
+        """Refuse source values the codec cannot hold; a value beside the end of the range by rounding is none of them."""
+        limits = self._target.codec.value_range
+        if limits is None:
+            return
+        margin = 1e-6 * (limits[1] - limits[0])
+        if low < limits[0] - margin or high > limits[1] + margin:
+            raise InputError(
+                f"codec {self._target.codec.spec} holds values from {limits[0]:.9g} to {limits[1]:.9g} only, but the source has "
+                f"{low:.9g} to {high:.9g} in block {address}; use another scale and offset, or lerc"
+            )
+
+
+def _floats(values: NDArray[np.generic]) -> tuple[float, ...]:
+    return tuple(float(value) for value in values)
+
+
+def _completed(samples: Samples, mask: Mask | None, seen: Rect, whole: Rect, block: BlockFormat) -> tuple[Samples, Mask | None]:
+    """Fill what of ``whole`` lies outside its level by repeating the edge, never black; transparent if there is alpha, void for heights.
+
+    Void padding is what a client must see (there is no ground), and it costs nothing: coded as ground, the repeated last row of a
+    1025 x 1025 terrain takes as many bytes as a full block.
+    """
+    if seen == whole:
+        return samples, mask
+    missing = ((seen.y0 - whole.y0, whole.y1 - seen.y1), (seen.x0 - whole.x0, whole.x1 - seen.x1))
+    completed = np.pad(samples, (*missing, (0, 0)), mode="edge")
+    if block.alpha:
+        completed[..., -1] = np.pad(samples[..., -1], missing)
+    if block.kind == "height":
+        mask = np.pad(np.ones(samples.shape[:2], np.bool_) if mask is None else mask, missing)
+    return completed, mask
