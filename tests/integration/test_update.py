@@ -190,6 +190,20 @@ def test_a_source_that_changes_while_it_is_read_is_not_published(tmp_path: Path)
     assert build_layer(source, tmp_path / "out", settings()).tasks_kept > 0
 
 
+def test_a_source_that_changes_early_is_noticed_early(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tiler.building.layer._LOOK_EVERY_S", 0.0)
+    source = write_tiff(tmp_path / "photo.tif", photo(600, 600))
+    seen = []
+
+    def touch(done: int, total: int) -> None:
+        seen.append(done / total)
+        os.utime(source, (1, 1))
+
+    with pytest.raises(InputError, match=r"photo\.tif: was changed while it was read"):
+        build_layer(source, tmp_path / "out", settings(workers=1, task=64), touch)
+    assert max(seen) < 0.2
+
+
 @given(
     edits=st.lists(st.tuples(st.integers(0, 270), st.integers(0, 250), st.integers(1, 90), st.integers(1, 90)), min_size=1, max_size=3),
     pad=st.sampled_from([0, 2]),

@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from time import monotonic
+from typing import Final
 
 from schemas.errors import ClipmapError
 from schemas.manifest import Manifest
@@ -24,6 +26,7 @@ from tiler.tasks.records import PlanRecord, RecordBook
 from tiler.tasks.stamps import SourceStamps
 from tiler.tasks.worker import Done, TaskWorker, Work
 
+_LOOK_EVERY_S: Final = 30.0
 Progress = Callable[[int, int], None]
 """Called with (blocks finished, blocks in all), from any thread, one call at a time."""
 
@@ -54,6 +57,7 @@ class LayerBuild:
         self._book = RecordBook(store, intent.tasks_path)
         self._is_update = intent.act == "update"
         self._is_continued = intent.path in claim.abandoned
+        self._next_look = monotonic() + _LOOK_EVERY_S
         self.times = StageTimes()
         self.kept = self.written = self._noted = 0
         self.changed = False
@@ -112,6 +116,7 @@ class LayerBuild:
             with closing(self._engine.run(worker, self._works(worker, tier, pieces))) as finished:
                 for done in finished:
                     self._note(done, ledger)
+                    self._look_at_source()
                     if done.record.piece is not None:
                         handed_on[done.task] = done.record.piece
             pieces = handed_on
@@ -125,6 +130,12 @@ class LayerBuild:
         self._book.write_plan(record.model_copy(update={"act": "build"}))
         RecordBook(self._store, intent.path).delete()
         return result
+
+    def _look_at_source(self) -> None:
+        """Raise InputError if a source file has changed; looked at so often that a build does not go on for hours for nothing."""
+        if monotonic() > self._next_look:
+            self._stamps.require_unchanged()
+            self._next_look = monotonic() + _LOOK_EVERY_S
 
     def _works(self, worker: TaskWorker, tier: Tier, pieces: dict[Task, str]) -> Iterator[Work]:
         for task in self.plan.tasks(tier):
