@@ -20,7 +20,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .PHONY: help
 help: ## this list
-	@grep -hE '^[a-z-]+:.*## ' $(firstword $(MAKEFILE_LIST)) | sed -E 's/:.*## /\t/' | expand -t 10
+	@grep -hE '^[a-z-]+:.*## ' $(firstword $(MAKEFILE_LIST)) | sed -E 's/:.*## /\t/' | expand -t 13
 
 .PHONY: install
 install: $(VENV)/.installed ## clipmap and its tools in .venv
@@ -42,6 +42,10 @@ lint: $(VENV)/.installed ## style, types and import directions
 .PHONY: bench
 bench: $(VENV)/.installed ## time per stage of a build; raw results in tests/bench/results
 	@$(BIN)/python tests/bench/stages.py
+
+.PHONY: bench-peers
+bench-peers: $(VENV)/.installed ## clipmap beside vips, GDAL and OpenImageIO: writes the tables of docs/PERFORMANCE.md
+	@$(BIN)/python tests/bench/peers.py
 
 .PHONY: docs
 docs: $(VENV)/.installed ## write the generated parts of docs/ anew
