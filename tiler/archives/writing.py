@@ -6,7 +6,6 @@ tile, works on one thread, and keeps some 220 bytes a tile. Memory: about 150 by
 afterwards, and the blocks under way.
 """
 
-import fcntl
 import os
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
@@ -28,6 +27,7 @@ from tiler.archives.plan import ArchivePlan, plan_archive
 from tiler.checking.checkedread import read_block
 from tiler.stores.archive import unfinished
 from tiler.stores.dataset import Dataset
+from tiler.stores.filelock import open_locked
 from tiler.stores.tilefile import HEADER_BYTES
 from tiler.tasks.engine import run_tasks
 
@@ -98,7 +98,7 @@ def _reserved(target: Path, plan: ArchivePlan, resumable: bool) -> Iterator[tupl
     """
     temporary = unfinished(target)
     try:
-        descriptor = _locked(temporary, target)
+        descriptor = open_locked(temporary, lambda taken: StorageError(f"{target}: another process is writing it; wait until it has ended"))
     except OSError as error:
         raise StorageError(f"{target}: cannot be written: {error.strerror}") from error
     try:
@@ -116,20 +116,6 @@ def _reserved(target: Path, plan: ArchivePlan, resumable: bool) -> Iterator[tupl
         raise
     finally:
         os.close(descriptor)
-
-
-def _locked(temporary: Path, target: Path) -> int:
-    """Open the unfinished file and keep other processes out of it as long as it is open; raises StorageError if one is in it."""
-    while True:
-        descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(descriptor)
-            raise StorageError(f"{target}: another process is writing it; wait until it has ended") from None
-        if temporary.exists() and os.path.samestat(os.fstat(descriptor), temporary.stat()):
-            return descriptor
-        os.close(descriptor)  # its owner published or deleted it between our opening and locking it
 
 
 def _begin(descriptor: int, plan: ArchivePlan) -> bool:

@@ -97,9 +97,10 @@ def find_ranges_known(store: Store, claim: Claim, dataset: Manifest | None, sour
         record = RecordBook(store, layer.path).plan()
         if record is not None and record.settings.stretch != settings.stretch:
             raise _other_settings(store, name, f"stretch was {record.settings.stretch or 'none'}, now {settings.stretch}")
+    stamps = SourceStamps(source.info).stamps
     for path in [*(path for path in claim.abandoned if layer_of(path) == name), *([] if layer is None else [layer.path])]:
         record = RecordBook(store, path).plan()
-        if record is None or record.stamps != SourceStamps(source.info).stamps:
+        if record is None or record.stamps != stamps:
             continue
         same = all(getattr(record.settings, field) == getattr(settings, field) for field in ("stretch", "bands", "nodata"))
         if same and record.ranges:

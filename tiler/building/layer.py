@@ -93,13 +93,10 @@ class LayerBuild:
                 finished = self._noted if self._is_update else self._book.finished()
                 if finished > 0:
                     error.add_note(f"{finished} of {self.plan.task_count} tasks are finished and kept: the same command goes on from there")
-                elif not self._is_continued and not self._is_published():
+                elif not self._is_continued:
                     self._store.delete_prefix(self._intent.path)
                     self._claim.announce(*self._intent.kept, *self._intent.obsolete)
             raise
-
-    def _is_published(self) -> bool:
-        return self.manifest is not self._dataset
 
     def _build(self, on_progress: Progress) -> Published:
         plan, intent = self.plan, self._intent

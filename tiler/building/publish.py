@@ -50,7 +50,7 @@ def publish_update(plan: Plan, store: Store, path: str, ledger: Ledger, publishe
     """Publish a layer of which ``path`` has the blocks that differ from those of ``published``; nothing happens if nothing differs."""
     old = published.manifest.layers[plan.name]
     levels = range(plan.lattice.levels)
-    before = [read_index(published, plan.name, level) for level in levels]
+    before = [_read_index(published, plan.name, level) for level in levels]
     # The records in an index hold the range of the samples before they are encoded: it may differ where no block does.
     if all(ledger.index(level) == index for level, index in zip(levels, before, strict=True)):
         entry = _layer_entry(plan, old.path, old.patches, ledger)
@@ -73,7 +73,7 @@ def publish_update(plan: Plan, store: Store, path: str, ledger: Ledger, publishe
     return Published(manifest, True, [key for key in keys if key.partition("/")[0] not in dropped], dropped)
 
 
-def read_index(published: Dataset, name: str, level: int) -> bytes | None:
+def _read_index(published: Dataset, name: str, level: int) -> bytes | None:
     """Return the bytes of a published index, None if it is damaged: then every block of the level counts as changed."""
     try:
         return published.index(name, level).data
@@ -91,12 +91,17 @@ def _merged(
     """Copy the blocks of all older patches under ``path``: every patch costs readers time, on every block."""
     moved = [bytes(len(bitmap)) for bitmap in differing]
     for patch in old.patches:
-        own = [unpack_bitmap(text, count, f"patch {patch.path!r}") for text, count in zip(patch.levels, counts, strict=True)]
-        moved = [_or(a, _without(b, c)) for a, b, c in zip(moved, own, differing, strict=True)]
+        moved = [_or(a, b) for a, b in zip(moved, _left_of(patch, differing, counts), strict=True)]
     for address in _addresses(plan.lattice, moved):
         key = block_key(path, plan.name, address, plan.lattice.levels, plan.codec.suffix)
         store.write(key, store.read(old.block_key(plan.name, address)))
     return [_or(a, b) for a, b in zip(differing, moved, strict=True)], [_or(a, b) for a, b in zip(stored, moved, strict=True)]
+
+
+def _left_of(patch: Patch, changed: list[bytes], counts: list[int]) -> list[bytes]:
+    """Return the bitmaps of the blocks of a patch that are not ``changed``."""
+    own = [unpack_bitmap(text, count, f"patch {patch.path!r}") for text, count in zip(patch.levels, counts, strict=True)]
+    return [_without(bitmap, gone) for bitmap, gone in zip(own, changed, strict=True)]
 
 
 def _or(a: bytes, b: bytes) -> bytes:
@@ -120,10 +125,7 @@ def _trimmed(old: Layer, changed: list[bytes], counts: list[int]) -> tuple[list[
     """Return the layer's patches without the blocks that are ``changed``, and the paths of those that have none left."""
     patches, dropped = [], []
     for patch in old.patches:
-        bitmaps = [unpack_bitmap(text, count, f"patch {patch.path!r}") for text, count in zip(patch.levels, counts, strict=True)]
-        left = [
-            bytes(own & ~gone & 0xFF for own, gone in zip(bitmap, lost, strict=True)) for bitmap, lost in zip(bitmaps, changed, strict=True)
-        ]
+        left = _left_of(patch, changed, counts)
         if any(map(any, left)):
             levels = [pack_bitmap(bitmap, count) for bitmap, count in zip(left, counts, strict=True)]
             patches.append(Patch(path=patch.path, levels=levels))

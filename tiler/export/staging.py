@@ -1,6 +1,5 @@
 """Exports appear under their name only when they are whole: written beside it under a hidden name, then renamed."""
 
-import fcntl
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,6 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from schemas.errors import StorageError, UsageError
+from tiler.stores.filelock import open_locked
 
 PREFIX: Final = ".tmp-"
 
@@ -31,7 +31,7 @@ def staged(target: Path) -> Iterator[Path]:
     """
     temporary = target.with_name(f"{PREFIX}{target.name}")
     with storage_errors(target):
-        descriptor = _locked(temporary, target)
+        descriptor = open_locked(temporary, lambda taken: StorageError(f"{target}: another export is writing it; wait until it has ended"))
         try:
             os.ftruncate(descriptor, 0)
             yield temporary
@@ -42,20 +42,6 @@ def staged(target: Path) -> Iterator[Path]:
             raise
         finally:
             os.close(descriptor)
-
-
-def _locked(temporary: Path, target: Path) -> int:
-    """Return the descriptor of the file at ``temporary``, made if need be, which this process alone may write."""
-    while True:
-        descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(descriptor)
-            raise StorageError(f"{target}: another export is writing it; wait until it has ended") from None
-        if temporary.exists() and os.path.samestat(os.fstat(descriptor), temporary.stat()):
-            return descriptor
-        os.close(descriptor)  # its owner renamed it between our opening and locking it
 
 
 @contextmanager

@@ -1,7 +1,6 @@
 """A store in a directory: one file per key, written to a temporary name and renamed."""
 
 import ctypes
-import fcntl
 import os
 import shutil
 import threading
@@ -12,6 +11,7 @@ from pathlib import Path
 
 from schemas.errors import NotFoundError, StorageError
 from tiler.stores.claims import CLAIM_NAME, MAX_CLAIM_BYTES, ClaimNote
+from tiler.stores.filelock import open_locked
 from tiler.stores.keys import check_key
 
 _TEMPORARY = ".tmp-"
@@ -132,7 +132,7 @@ class DirectoryStore:
         try:
             made = [folder for folder in (self._root, *self._root.parents) if not folder.exists()]
             self._root.mkdir(parents=True, exist_ok=True)
-            descriptor = self._locked(path, break_stale)
+            descriptor = open_locked(path, lambda taken: StorageError(_at_work(self.location, _read_note(taken), break_stale)))
         except (FileExistsError, NotADirectoryError):
             raise StorageError(f"{self._root}: a file is in the way, or a link that leads nowhere; choose another folder") from None
         except OSError as error:
@@ -159,19 +159,6 @@ class DirectoryStore:
             for name in names:
                 if name.startswith(_TEMPORARY):
                     Path(parent, name).unlink(missing_ok=True)
-
-    def _locked(self, path: Path, break_stale: bool) -> int:
-        while True:
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                note = _read_note(descriptor)
-                os.close(descriptor)
-                raise StorageError(_at_work(self.location, note, break_stale)) from None
-            if path.exists() and os.path.samestat(os.fstat(descriptor), path.stat()):
-                return descriptor
-            os.close(descriptor)  # its owner removed the file between our opening and locking it
 
 
 class BuildClaim:

@@ -31,17 +31,19 @@ class NewBlocks:
         self._store = store
         self._path, self._name, self._levels, self._suffix = path, name, levels, suffix
 
+    def _own_key(self, address: BlockAddress) -> str:
+        return block_key(self._path, self._name, address, self._levels, self._suffix)
+
     def key(self, address: BlockAddress, record: BlockRecord) -> str | None:
         """Return the block's key under the path; never None."""
-        return block_key(self._path, self._name, address, self._levels, self._suffix)
+        return self._own_key(address)
 
     def holds(self, address: BlockAddress, record: BlockRecord) -> bool:
         """Whether the stored bytes are those that ``record`` describes; they are read, for a power cut may leave files without content."""
-        key = self.key(address, record)
-        if record.blank or key is None:
+        if record.blank:
             return True
         try:
-            return digest(self._store.read(key)) == record.digest
+            return digest(self._store.read(self._own_key(address))) == record.digest
         except NotFoundError:
             return False
 
@@ -62,7 +64,7 @@ class ChangedBlocks(NewBlocks):
 
     def key(self, address: BlockAddress, record: BlockRecord) -> str | None:
         """Return the block's key under the path; None if the published layer has the same bytes."""
-        return None if self._is_published(address, record) else super().key(address, record)
+        return None if self._is_published(address, record) else self._own_key(address)
 
     def holds(self, address: BlockAddress, record: BlockRecord) -> bool:
         """Whether the bytes are published (then ``verify`` answers for them), or stored under the path."""
