@@ -17,6 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from docs.markers import with_content
+
 DOCS = Path(__file__).parent
 RESULTS = DOCS.parent / "tests/bench/results"
 TARGET = DOCS / "SCALE.md"
@@ -178,12 +180,7 @@ def walls(configs: list[Config]) -> str:
 def main() -> None:
     """Write the tables between the markers."""
     configs = load()
-    text = TARGET.read_text(encoding="utf-8")
-    before, _, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not end:
-        raise SystemExit(f"{TARGET}: one of the two markers is missing")
-    TARGET.write_text(f"{before}{BEGIN}\n\n{amounts(configs)}\n\n{walls(configs)}\n\n{END}{after}", encoding="utf-8")
+    TARGET.write_text(with_content(TARGET, BEGIN, END, f"{amounts(configs)}\n\n{walls(configs)}"), encoding="utf-8")
 
 
 if __name__ == "__main__":

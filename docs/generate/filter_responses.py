@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Final, get_args
 
+from docs.markers import with_content
 from schemas.lattice import Registration
 from schemas.manifest import KernelName
 from tiler.accuracy.response import figures
@@ -48,12 +49,7 @@ def tables() -> str:
 
 def generate() -> str:
     """Return the text of the file: what is there now, with what lies between the markers made anew."""
-    text = TARGET.read_text(encoding="utf-8")
-    before, _, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not end:
-        raise ValueError(f"{TARGET}: one of the two markers is missing")
-    return f"{before}{BEGIN}\n\n{tables()}\n\n{END}{after}"
+    return with_content(TARGET, BEGIN, END, tables())
 
 
 if __name__ == "__main__":

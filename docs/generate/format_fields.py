@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 from typing import Any, Final
 
+from docs.markers import with_content
 from schemas.manifest import Manifest
 
 TARGET = Path(__file__).parents[1] / "FORMAT.md"
@@ -72,12 +73,7 @@ def fields() -> str:
 
 def generate() -> str:
     """Return the text of the file: what is there now, with what lies between the markers made anew."""
-    text = TARGET.read_text(encoding="utf-8")
-    before, _, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not end:
-        raise ValueError(f"{TARGET}: one of the two markers is missing")
-    return f"{before}{BEGIN}\n\n{fields()}\n\n{END}{after}"
+    return with_content(TARGET, BEGIN, END, fields())
 
 
 if __name__ == "__main__":
