@@ -65,8 +65,11 @@ def quadcode(address: BlockAddress, levels: int) -> str:
     digits = levels - 1 - address.level
     if digits < 0 or address.x >> digits or address.y >> digits:
         raise UsageError(f"block {address} lies outside a quadtree of {levels} levels")
+    if not digits:
+        return ""
     y_up = (1 << digits) - 1 - address.y
-    return "".join(str((address.x >> b & 1) + 2 * (y_up >> b & 1)) for b in range(digits - 1, -1, -1))
+    # Binary digits read as decimal ones add without a carry, digit by digit.
+    return f"{int(f'{address.x:b}') + 2 * int(f'{y_up:b}'):0{digits}d}"
 
 
 def address_of(code: str, levels: int) -> BlockAddress:

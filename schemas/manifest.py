@@ -337,11 +337,6 @@ def digest(data: bytes | bytearray) -> str:
     return hashlib.blake2b(data, digest_size=16).hexdigest()
 
 
-def new_digest() -> "hashlib.blake2b":
-    """Return what computes ``digest`` of bytes that come in parts: feed it with ``update``, ask for ``hexdigest``."""
-    return hashlib.blake2b(digest_size=16)
-
-
 def parse_manifest(data: bytes, where: str) -> Manifest:
     """Return the manifest in ``data``; raises InputError that names ``where`` and the first thing that is wrong."""
     try:

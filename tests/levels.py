@@ -27,24 +27,37 @@ def run_cascade(
     clamp: bool = False,
     name: KernelName = "blackman-sinc",
     portion: int = 1 << 30,
+    lean: bool = False,
 ) -> list[LevelRows]:
-    """Return (held window, values, coverage) of every level for one window of the whole picture."""
+    """Return (held window, values, coverage) of every level for one window of the whole picture.
+
+    ``lean``: the coverage of portions that are whole is left out, as sources do.
+    """
     registration, edge = KINDS[kind]
     height, width, channels = values.shape
     kernel = DESIGNS[name](radius, registration)
     windows = held_windows((width, height), core or Rect(0, 0, width, height), [pad] * levels, kernel.reach)
     rows: list[list[tuple[int, Values, Coverage | None]]] = [[] for _ in range(levels)]
+
+    def covered_part(part: Values, covered: Coverage | None) -> Coverage | None:
+        if coverage is None:
+            assert covered is None
+            return None
+        return np.ones(part.shape[:2], np.float32) if covered is None else covered.copy()
+
     cascade = Cascade(
         (width, height),
         windows,
         channels,
         Recipe(kernel, edge, coverage is not None, clamp),
-        lambda level, first, part, covered: rows[level].append((first, part.copy(), None if covered is None else covered.copy())),
+        lambda level, first, part, covered: rows[level].append((first, part.copy(), covered_part(part, covered))),
     )
     whole = windows[0]
     for y in range(whole.y0, whole.y1, portion):
         rows_columns = np.s_[y : min(whole.y1, y + portion), whole.x0 : whole.x1]
         covered = None if coverage is None else np.ascontiguousarray(coverage[rows_columns])
+        if lean and covered is not None and (covered == 1).all():
+            covered = None
         cascade.push(np.ascontiguousarray(values[rows_columns]), covered)
     result: list[LevelRows] = []
     for level, window in enumerate(windows):

@@ -16,7 +16,7 @@ from tiler.filters.decimate import coarsen_columns, coarsen_rows
 from tiler.filters.edges import extend
 from tiler.filters.kernels import blackman_sinc
 from tiler.rowfile import RowFile
-from tiler.tasks.cut import round_samples
+from tiler.tasks.rounding import round_samples
 
 ROOT = Path(__file__).parents[2]
 UINT8 = BlockFormat("imagery", 16, 1, "uint8")

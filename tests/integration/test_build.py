@@ -18,7 +18,7 @@ from tests.reference.terrain import photo, terrain
 from tiler.building.build import build_layer
 from tiler.codecs import BlockFormat
 from tiler.stores.dataset import open_dataset
-from tiler.tasks.cut import round_samples
+from tiler.tasks.rounding import round_samples
 
 
 @pytest.mark.parametrize("name", ["height", "photo"])

@@ -22,7 +22,7 @@ from tests.reference.terrain import adversarial_heights, photo, terrain
 from tiler.codecs import BlockFormat
 from tiler.filters.cascade import Coverage, Values
 from tiler.filters.kernels import DESIGNS, FIXED_RADIUS, blackman_sinc, covering, frequency_response
-from tiler.tasks.cut import round_samples
+from tiler.tasks.rounding import round_samples
 
 # Float32 keeps 24 bits: one halving rounds three times (two passes and the reference sample of each).
 ULPS_PER_LEVEL = 4

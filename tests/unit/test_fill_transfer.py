@@ -44,6 +44,9 @@ class ArraySource:
         part = np.s_[window.y0 : window.y1, window.x0 : window.x1]
         return self.values[part], None if self.coverage is None else self.coverage[part]
 
+    def read_lean(self, window: Rect) -> tuple[Float32, Float32 | None]:
+        return self.read(window)
+
     def begin(self) -> None:
         """Nothing to digest."""
 

@@ -88,8 +88,8 @@ def run_cascade(
         if level:
             target, target_coverage = results[level - 1]
             target[first : first + len(rows)] = rows
-            if target_coverage is not None and covered is not None:
-                target_coverage[first : first + len(rows)] = covered
+            if target_coverage is not None:
+                target_coverage[first : first + len(rows)] = 1 if covered is None else covered
 
     _push(values, coverage, kernel, edge, count, sink)
     return results

@@ -20,7 +20,7 @@ from tiler.filters.cascade import Cascade, Coverage, Recipe, Values, halve, held
 from tiler.filters.kernels import DESIGNS
 from tiler.samples.transfer import light_of_codes
 from tiler.stores.dataset import Dataset
-from tiler.tasks.cut import round_samples
+from tiler.tasks.rounding import round_samples
 
 _QUEUED_PER_WORKER: Final = 2
 """Finished tiles that may wait for a slower one before them: enough to keep workers busy, and what bounds the memory."""

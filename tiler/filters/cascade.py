@@ -8,20 +8,29 @@ level into windows of any shape gives the same bits as filtering it in one piece
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.lattice import support
 from schemas.region import Rect
-from tiler.filters.decimate import clamp_to_support, coarsen_columns, coarsen_partial, coarsen_rows, flag_partial
+from tiler.filters.decimate import (
+    clamp_to_support,
+    coarsen_columns,
+    coarsen_partial,
+    coarsen_rows,
+    coarsen_rows_of_integers,
+    flag_partial,
+)
 from tiler.filters.edges import EdgeRule, extend
 from tiler.filters.kernels import Kernel, covering
 
-Values = NDArray[np.float32]
+Values = NDArray[Any]
+"""Samples (rows, columns, channels): float32, or whole numbers of 8 or 16 bits as long as nothing has been filtered."""
 Coverage = NDArray[np.float32]
 Sink = Callable[[int, int, Values, Coverage | None], None]
-"""Takes (level, first row, values (rows, columns, channels), coverage (rows, columns) or None) of a level's window."""
+"""Takes (level, first row, values (rows, columns, channels), coverage (rows, columns), None if it is 1) of a level's window."""
 
 
 def halve(size: tuple[int, int]) -> tuple[int, int]:
@@ -61,6 +70,53 @@ class Recipe:
     clamp: bool = False
 
 
+class _Rows:
+    """Rows of a level that a stage still needs: one array that rows are added to below and taken from above, moved and not made anew.
+
+    ``coverage`` is None while all rows are whole, as those of most elevation models are.
+    """
+
+    def __init__(self, columns: int, channels: int) -> None:
+        self._columns, self._channels = columns, channels
+        self._values: Values = np.empty((0, columns, channels), np.float32)
+        self._coverage: Coverage | None = None
+        self.count = 0
+
+    @property
+    def values(self) -> Values:
+        """The rows (count, columns, channels)."""
+        return self._values[: self.count]
+
+    @property
+    def coverage(self) -> Coverage | None:
+        """Their coverage (count, columns), None if it is 1."""
+        return None if self._coverage is None else self._coverage[: self.count]
+
+    def add(self, count: int, dtype: np.dtype[Any], covered: bool) -> None:
+        """Add ``count`` rows at the bottom, whole and without values; ``covered``: their coverage will be set."""
+        needed = self.count + count
+        if needed > len(self._values) or self._values.dtype != dtype:
+            values = np.empty((needed, self._columns, self._channels), dtype)
+            values[: self.count] = self.values
+            self._values = values
+        if covered and self._coverage is None:
+            self._coverage = np.ones(self._values.shape[:2], np.float32)
+        if self._coverage is not None and len(self._coverage) < needed:
+            self._coverage = np.concatenate([self._coverage[: self.count], np.ones((needed - self.count, self._columns), np.float32)])
+        if self._coverage is not None:
+            self._coverage[self.count : needed] = 1
+        self.count = needed
+
+    def drop(self, count: int) -> None:
+        """Forget the first ``count`` rows."""
+        self.count -= count
+        self._values[: self.count] = self._values[count : count + self.count]
+        if self._coverage is not None:
+            self._coverage[: self.count] = self._coverage[count : count + self.count]
+            if (self._coverage[: self.count] == 1).all():
+                self._coverage = None
+
+
 class _Stage:
     """One halving: takes rows of a window of the finer level, gives rows of a window of the coarser one."""
 
@@ -74,19 +130,20 @@ class _Stage:
         self._twin = 1 if kernel.registration == "area" else 0
         self._left = max(0, fine.x0 - (2 * coarse.x0 - self._before))
         self._right = max(0, 2 * (coarse.x1 - 1) + self._after + 1 - fine.x1)
-        columns = self._left + fine.width + self._right
-        self._values = np.empty((0, columns, channels), np.float32)
-        self._coverage = np.empty((0, columns), np.float32) if recipe.masked else None
-        self._top = fine.y0
+        self._rows = _Rows(self._left + fine.width + self._right, channels)
         self._next = coarse.y0
-        self._top_missing = max(0, fine.y0 - (2 * coarse.y0 - self._before))
+        self._above = max(0, fine.y0 - (2 * coarse.y0 - self._before))
+        self._top = fine.y0 - self._above
+        self._awaits_top = self._above > 0
 
     def push(self, values: Values, coverage: Coverage | None) -> tuple[int, Values, Coverage | None] | None:
         """Take the next rows of the window; return (first row, values, coverage) of the coarse rows that became complete."""
-        self._append(*self._widened(values, coverage))
-        bottom = self._top + len(self._values)
+        if self._awaits_top and not self._rows.count:
+            self._rows.add(self._above, values.dtype, covered=False)
+        self._append(values, coverage)
+        bottom = self._top + self._rows.count
         complete = bottom == self._fine.y1
-        if self._top_missing:
+        if self._awaits_top:
             if not complete and bottom <= self._before:
                 return None
             self._extend_top()
@@ -94,49 +151,60 @@ class _Stage:
             self._extend_bottom()
         return self._emit()
 
-    def _widened(self, values: Values, coverage: Coverage | None) -> tuple[Values, Coverage | None]:
-        """Add the columns beyond the level's left and right edge."""
-        for indices, at_start in ((range(-self._left, 0), True), (range(self._size[0], self._size[0] + self._right), False)):
+    def _append(self, values: Values, coverage: Coverage | None) -> None:
+        """Add rows, with the columns beyond the level's left and right edge."""
+        first, left, width = self._rows.count, self._left, self._fine.width
+        self._rows.add(len(values), values.dtype, covered=coverage is not None)
+        place = self._rows.values[first:]
+        place[:, left : left + width] = values
+        covered = None if coverage is None or self._rows.coverage is None else self._rows.coverage[first:]
+        if covered is not None:
+            covered[:, left : left + width] = coverage
+        for indices, start in ((range(-left, 0), 0), (range(self._size[0], self._size[0] + self._right), left + width)):
             if not indices:
                 continue
-            turned = values.transpose(1, 0, 2)
-            strip, covered = extend(
-                turned,
+            strip, strip_covered = extend(
+                values.transpose(1, 0, 2),
                 None if coverage is None else coverage.T,
                 rule=self._recipe.edge,
                 size=self._size[0],
-                origin=self._fine.x0 - (0 if at_start else self._left),
+                origin=self._fine.x0,
                 indices=indices,
             )
-            parts = [strip.transpose(1, 0, 2), values]
-            values = np.concatenate(parts if at_start else parts[::-1], axis=1)
-            if coverage is not None and covered is not None:
-                coverage = np.concatenate([covered.T, coverage] if at_start else [coverage, covered.T], axis=1)
-        return values, coverage
+            place[:, start : start + len(indices)] = strip.transpose(1, 0, 2)
+            if covered is not None and strip_covered is not None:
+                covered[:, start : start + len(indices)] = strip_covered.T
 
-    def _append(self, values: Values, coverage: Coverage | None) -> None:
-        self._values = np.concatenate([self._values, values]) if len(self._values) else values
-        if self._coverage is not None and coverage is not None:
-            self._coverage = np.concatenate([self._coverage, coverage]) if len(self._coverage) else coverage
-
-    def _beyond(self, indices: range) -> tuple[Values, Coverage | None]:
-        return extend(self._values, self._coverage, rule=self._recipe.edge, size=self._size[1], origin=self._top, indices=indices)
+    def _extend(self, place: int, indices: range) -> None:
+        """Set the rows from ``place`` on to what the edge rule makes of the rows beyond the top or bottom edge."""
+        skipped = self._above if self._awaits_top else 0
+        coverage = None if self._rows.coverage is None else self._rows.coverage[skipped:]
+        strip, covered = extend(
+            self._rows.values[skipped:],
+            coverage,
+            rule=self._recipe.edge,
+            size=self._size[1],
+            origin=self._top + skipped,
+            indices=indices,
+        )
+        end = place + len(indices)
+        if end > self._rows.count:
+            self._rows.add(end - self._rows.count, self._rows.values.dtype, covered=False)
+        self._rows.values[place:end] = strip
+        if covered is not None and self._rows.coverage is not None:
+            self._rows.coverage[place:end] = covered
 
     def _extend_top(self) -> None:
-        values, coverage = self._beyond(range(-self._top_missing, 0))
-        self._values = np.concatenate([values, self._values])
-        if self._coverage is not None and coverage is not None:
-            self._coverage = np.concatenate([coverage, self._coverage])
-        self._top -= self._top_missing
-        self._top_missing = 0
+        self._extend(0, range(-self._above, 0))
+        self._awaits_top = False
 
     def _extend_bottom(self) -> None:
         missing = 2 * (self._coarse.y1 - 1) + self._after + 1 - self._fine.y1
         if missing > 0:
-            self._append(*self._beyond(range(self._size[1], self._size[1] + missing)))
+            self._extend(self._rows.count, range(self._size[1], self._size[1] + missing))
 
     def _emit(self) -> tuple[int, Values, Coverage | None] | None:
-        bottom = self._top + len(self._values)
+        bottom = self._top + self._rows.count
         last = min(self._coarse.y1, (bottom - 1 - self._after) // 2 + 1)
         first, count = self._next, last - self._next
         if count <= 0:
@@ -149,45 +217,47 @@ class _Stage:
         self._next = last
         keep = 2 * last - self._before - self._top
         if keep > 0:
-            self._values = self._values[keep:].copy()
-            self._coverage = None if self._coverage is None else self._coverage[keep:].copy()
+            self._rows.drop(keep)
             self._top += keep
         return first, values, coverage
 
     def _filtered(self, row: int, column: int, count: int) -> Values:
-        columns, channels = self._values.shape[1:]
+        fine = self._rows.values
+        columns, channels = fine.shape[1:]
         halved = np.empty((count, columns * channels), np.float32)
-        flat = self._values.reshape(len(self._values), columns * channels)
-        coarsen_rows(flat, row, self._low, self._high, self._weights, self._twin, halved)
+        filter_rows = coarsen_rows if fine.dtype == np.float32 else coarsen_rows_of_integers
+        filter_rows(fine.reshape(len(fine), columns * channels), row, self._low, self._high, self._weights, self._twin, halved)
         coarse = np.empty((count, self._coarse.width, channels), np.float32)
         wide = halved.reshape(count, columns, channels)
         coarsen_columns(wide, column, self._low, self._high, self._weights, self._twin, coarse)
         return coarse
 
     def _partial(self, row: int, column: int, values: Values) -> Coverage | None:
-        """Redo the samples that see voids; return the coarse coverage."""
-        if self._coverage is None:
+        """Redo the samples that see voids; return the coarse coverage, None if there are none."""
+        fine_coverage = self._rows.coverage
+        if fine_coverage is None:
             return None
         offsets, weights = self._recipe.kernel.taps()
         flags = np.empty(values.shape[:2], np.uint8)
+        if not flag_partial(fine_coverage, row, column, offsets, flags):
+            return None
         coverage = np.ones(values.shape[:2], np.float32)
-        if flag_partial(self._coverage, row, column, offsets, flags):
-            positive, positive_weights = covering(self._recipe.kernel.registration).taps()
-            coarsen_partial(
-                self._values, self._coverage, row, column, offsets, weights, positive, positive_weights, flags, values, coverage
-            )
+        positive, positive_weights = covering(self._recipe.kernel.registration).taps()
+        coarsen_partial(
+            self._rows.values, fine_coverage, row, column, offsets, weights, positive, positive_weights, flags, values, coverage
+        )
         return coverage
 
     def _clamp(self, row: int, column: int, values: Values) -> None:
         offsets, _ = self._recipe.kernel.taps()
         inside = (
             max(0, -self._top),
-            min(len(self._values), self._size[1] - self._top),
+            min(self._rows.count, self._size[1] - self._top),
             self._left,
             self._left + self._fine.width,
         )
-        coverage = _NO_COVERAGE if self._coverage is None else self._coverage
-        clamp_to_support(self._values, coverage, row, column, offsets, inside, values)
+        coverage = _NO_COVERAGE if self._rows.coverage is None else self._rows.coverage
+        clamp_to_support(self._rows.values, coverage, row, column, offsets, inside, values)
 
 
 _NO_COVERAGE = np.empty((0, 0), np.float32)
@@ -197,7 +267,8 @@ class Cascade:
     """Turns rows of a window of one level into rows of the windows of this and all coarser levels.
 
     ``windows`` come from ``held_windows``; rows are pushed top to bottom, in portions of any height, as values
-    (rows, width, channels) float32 and coverage (rows, width) float32, None unless ``recipe.masked``. Void samples must be 0.
+    (rows, width, channels), float32 or, if the edge rule mirrors, of 8 or 16 bits, and coverage (rows, width) float32, None where all
+    samples are whole, always unless ``recipe.masked``. Void samples must be 0. What the sink is given it may keep.
     """
 
     def __init__(self, size: tuple[int, int], windows: Sequence[Rect], channels: int, recipe: Recipe, sink: Sink) -> None:

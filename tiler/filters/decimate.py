@@ -14,14 +14,83 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 Flags = NDArray[np.uint8]
+Integers = NDArray[np.uint8] | NDArray[np.uint16]
 Bounds = tuple[int, int, int, int]
 
 _CHUNK = 1024
-"""Columns filtered at once: reference and sum (8 KiB) stay in the first-level cache."""
+"""Samples of a row filtered at once: what is summed (8 KiB) stays in the first-level cache, integers as float32 (310 KiB) in the second."""
 
 ENOUGH_WEIGHT = 0.5
 FULL_WEIGHT = 0.9
 """Between these sums of weights the sinc takes over from the covering kernel (see ``coarsen_partial``)."""
+
+
+@numba.njit(nogil=True, cache=True)
+def _sum_pairs(
+    source: Float32, low: Int64, high: Int64, row: int, column: int, weights: Float32, reference: Float32, total: Float32
+) -> None:
+    """Set ``total`` to ``reference`` plus the weighted differences to it, for every sample of ``total``.
+
+    Tap k is ``source`` at rows ``row + low[0, k]`` and ``row + high[0, k]``, from columns ``column + low[1, k]`` and
+    ``column + high[1, k]`` on. Three taps go at a time: sums are fetched and stored a third as often, which takes 0.7 of the time.
+    """
+    size = total.size
+    for x in range(size):
+        total[x] = np.float32(0)
+    k = 0
+    while k + 3 <= weights.size:
+        w0, w1, w2 = weights[k], weights[k + 1], weights[k + 2]
+        before0, after0 = source[row + low[0, k], column + low[1, k] :], source[row + high[0, k], column + high[1, k] :]
+        before1, after1 = source[row + low[0, k + 1], column + low[1, k + 1] :], source[row + high[0, k + 1], column + high[1, k + 1] :]
+        before2, after2 = source[row + low[0, k + 2], column + low[1, k + 2] :], source[row + high[0, k + 2], column + high[1, k + 2] :]
+        for x in range(size):
+            base = reference[x]
+            partial = total[x] + w0 * ((before0[x] - base) + (after0[x] - base))
+            partial = partial + w1 * ((before1[x] - base) + (after1[x] - base))
+            total[x] = partial + w2 * ((before2[x] - base) + (after2[x] - base))
+        k += 3
+    while k < weights.size:
+        weight = weights[k]
+        before, after = source[row + low[0, k], column + low[1, k] :], source[row + high[0, k], column + high[1, k] :]
+        for x in range(size):
+            base = reference[x]
+            total[x] += weight * ((before[x] - base) + (after[x] - base))
+        k += 1
+    for x in range(size):
+        total[x] = reference[x] + total[x]
+
+
+@numba.njit(nogil=True, cache=True)
+def _places(first: int, offsets: Int64, channels: int) -> Int64:
+    """Return (2, taps): for taps around column ``first``, which half holds them (0 even, 1 odd columns) and where it begins there."""
+    places = np.empty((2, offsets.size), np.int64)
+    for k in range(offsets.size):
+        places[0, k] = (first + offsets[k]) % 2
+        places[1, k] = (first + offsets[k]) // 2 * channels
+    return places
+
+
+@numba.njit(nogil=True, cache=True)
+def _in_rows(offsets: Int64) -> Int64:
+    """Return (2, taps): ``offsets`` as rows, and no columns."""
+    places = np.zeros((2, offsets.size), np.int64)
+    places[0] = offsets
+    return places
+
+
+@numba.njit(nogil=True, cache=True)
+def _coarsen_part(
+    fine: Float32, first: int, column: int, low: Int64, high: Int64, weights: Float32, twin: int, start: int, size: int, coarse: Float32
+) -> None:
+    """Filter ``size`` columns of ``fine`` from ``column`` on into those of ``coarse`` from ``start`` on."""
+    reference = np.empty(size, np.float32)
+    half = np.float32(0.5)
+    for j in range(coarse.shape[0]):
+        centre = first + 2 * j
+        upper, lower = fine[centre, column:], fine[centre + twin, column:]
+        for x in range(size):
+            reference[x] = half * (upper[x] + lower[x])
+        _sum_pairs(fine, low, high, centre, column, weights, reference, coarse[j, start : start + size])
 
 
 @numba.njit(nogil=True, cache=True)
@@ -31,27 +100,50 @@ def coarsen_rows(fine: Float32, first: int, low: Int64, high: Int64, weights: Fl
     Coarse row j is centred on fine row ``first + 2j`` (``twin`` 0, point) or between it and the next (``twin`` 1, area).
     """
     width = fine.shape[1]
-    reference = np.empty(_CHUNK, np.float32)
-    total = np.empty(_CHUNK, np.float32)
-    half = np.float32(0.5)
-    for j in range(coarse.shape[0]):
-        centre = first + 2 * j
-        for start in range(0, width, _CHUNK):
-            size = min(_CHUNK, width - start)
-            upper = fine[centre, start : start + size]
-            lower = fine[centre + twin, start : start + size]
+    before, after = _in_rows(low), _in_rows(high)
+    for start in range(0, width, _CHUNK):
+        _coarsen_part(fine, first, start, before, after, weights, twin, start, min(_CHUNK, width - start), coarse)
+
+
+@numba.njit(nogil=True, cache=True)
+def coarsen_rows_of_integers(fine: Integers, first: int, low: Int64, high: Int64, weights: Float32, twin: int, coarse: Float32) -> None:
+    """Do what ``coarsen_rows`` does with ``fine`` (rows, n) of whole numbers, to the same bits: they become float32 on the way.
+
+    A part of all rows is converted at a time, so that an 8-bit picture moves through memory as one byte a sample, not as four.
+    """
+    width = fine.shape[1]
+    before, after = _in_rows(low), _in_rows(high)
+    top = first + min(0, low.min())
+    rows = first + 2 * (coarse.shape[0] - 1) + max(twin, high.max()) + 1 - top
+    floats = np.empty((rows, _CHUNK), np.float32)
+    for start in range(0, width, _CHUNK):
+        size = min(_CHUNK, width - start)
+        for y in range(rows):
+            whole, converted = fine[top + y, start:], floats[y]
             for x in range(size):
-                reference[x] = half * (upper[x] + lower[x])
-                total[x] = np.float32(0)
-            for k in range(weights.size):
-                weight = weights[k]
-                before = fine[centre + low[k], start : start + size]
-                after = fine[centre + high[k], start : start + size]
-                for x in range(size):
-                    total[x] += weight * ((before[x] - reference[x]) + (after[x] - reference[x]))
-            out = coarse[j, start : start + size]
-            for x in range(size):
-                out[x] = reference[x] + total[x]
+                converted[x] = np.float32(whole[x])
+        _coarsen_part(floats, first - top, 0, before, after, weights, twin, start, size, coarse)
+
+
+@numba.njit(nogil=True, cache=True)
+def _split_columns(fine: Float32, columns: int, channels: int, halves: Float32) -> None:
+    """Lay the even and the odd of ``columns`` pixels apart: ``fine`` (columns * channels) to ``halves`` (2, ...)."""
+    even, odd = halves[0], halves[1]
+    pairs = columns // 2
+    if channels == 3:  # written out, or the compiler makes a loop of it that takes three times as long
+        for x in range(pairs):
+            even[3 * x], even[3 * x + 1], even[3 * x + 2] = fine[6 * x], fine[6 * x + 1], fine[6 * x + 2]
+            odd[3 * x], odd[3 * x + 1], odd[3 * x + 2] = fine[6 * x + 3], fine[6 * x + 4], fine[6 * x + 5]
+    elif channels == 1:
+        for x in range(pairs):
+            even[x], odd[x] = fine[2 * x], fine[2 * x + 1]
+    else:
+        for x in range(pairs):
+            for channel in range(channels):
+                even[channels * x + channel] = fine[2 * channels * x + channel]
+                odd[channels * x + channel] = fine[2 * channels * x + channels + channel]
+    if columns % 2:
+        even[pairs * channels : (pairs + 1) * channels] = fine[(columns - 1) * channels :]
 
 
 @numba.njit(nogil=True, cache=True)
@@ -62,31 +154,21 @@ def coarsen_columns(fine: Float32, first: int, low: Int64, high: Int64, weights:
     run over contiguous memory.
     """
     rows, columns, channels = fine.shape
-    width = coarse.shape[1]
-    halves = np.empty((2, columns // 2 + 1), np.float32)
-    reference = np.empty(width, np.float32)
-    total = np.empty(width, np.float32)
+    width = coarse.shape[1] * channels
+    halves = np.empty((2, (columns // 2 + 1) * channels), np.float32)
+    reference = np.empty(_CHUNK, np.float32)
     half = np.float32(0.5)
+    before, after = _places(first, low, channels), _places(first, high, channels)
+    centre = _places(first, np.array([0, twin]), channels)
     for j in range(rows):
-        for channel in range(channels):
-            for x in range(columns // 2):
-                halves[0, x] = fine[j, 2 * x, channel]
-                halves[1, x] = fine[j, 2 * x + 1, channel]
-            if columns % 2:
-                halves[0, columns // 2] = fine[j, columns - 1, channel]
-            left = halves[first % 2, first // 2 :]
-            right = halves[(first + twin) % 2, (first + twin) // 2 :]
-            for i in range(width):
-                reference[i] = half * (left[i] + right[i])
-                total[i] = np.float32(0)
-            for k in range(weights.size):
-                weight = weights[k]
-                before = halves[(first + low[k]) % 2, (first + low[k]) // 2 :]
-                after = halves[(first + high[k]) % 2, (first + high[k]) // 2 :]
-                for i in range(width):
-                    total[i] += weight * ((before[i] - reference[i]) + (after[i] - reference[i]))
-            for i in range(width):
-                coarse[j, i, channel] = reference[i] + total[i]
+        _split_columns(fine[j].reshape(columns * channels), columns, channels, halves)
+        out = coarse[j].reshape(width)
+        for start in range(0, width, _CHUNK):
+            size = min(_CHUNK, width - start)
+            left, right = halves[centre[0, 0], centre[1, 0] + start :], halves[centre[0, 1], centre[1, 1] + start :]
+            for x in range(size):
+                reference[x] = half * (left[x] + right[x])
+            _sum_pairs(halves, before, after, 0, start, weights, reference, out[start : start + size])
 
 
 @numba.njit(nogil=True, cache=True)

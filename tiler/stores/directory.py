@@ -18,6 +18,16 @@ _TEMPORARY = ".tmp-"
 _LIBC = ctypes.CDLL(None, use_errno=True)
 
 
+def _write_file(path: str, data: bytes) -> None:
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+    try:
+        written = os.write(descriptor, data)
+        while written < len(data):  # a file system that is nearly full, or more than 2 GiB
+            written += os.write(descriptor, memoryview(data)[written:])
+    finally:
+        os.close(descriptor)
+
+
 class DirectoryStore:
     """Keys are file paths below ``root``; the directory is created by the first write. Hidden names (``.x``) are no keys.
 
@@ -27,12 +37,13 @@ class DirectoryStore:
 
     def __init__(self, root: Path) -> None:
         self._root = root
-        self._known_folders: set[Path] = set()
+        self._folder = str(root)
+        self._known_folders: set[str] = set()
 
     @property
     def location(self) -> str:
         """The directory's path."""
-        return str(self._root)
+        return self._folder
 
     @property
     def scratch(self) -> Path:
@@ -55,26 +66,24 @@ class DirectoryStore:
 
     def write(self, key: str, data: bytes) -> None:
         """Put ``data`` under ``key`` in one step; raises StorageError."""
-        path = self._path(key)
-        temporary = path.with_name(f"{_TEMPORARY}{os.getpid()}-{threading.get_ident()}-{path.name}")
+        # Strings instead of Path objects: a build writes thousands of files a second, and every thread waits for this one meanwhile.
+        *folders, name = check_key(self.location, key)
+        folder = os.path.join(self._folder, *folders)
+        temporary = f"{folder}/{_TEMPORARY}{os.getpid()}-{threading.get_ident()}-{name}"
         try:
-            self._make_folder(path.parent)
+            self._make_folder(folder)
             try:
-                descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
-                with open(descriptor, "wb", buffering=0) as file:
-                    view = memoryview(data)
-                    while view:
-                        view = view[file.write(view) :]
-                os.replace(temporary, path)
+                _write_file(temporary, data)
+                os.replace(temporary, f"{folder}/{name}")
             except BaseException:
-                temporary.unlink(missing_ok=True)
+                Path(temporary).unlink(missing_ok=True)
                 raise
         except OSError as error:
-            raise StorageError(f"{path}: cannot be written: {error.strerror}") from error
+            raise StorageError(f"{folder}/{name}: cannot be written: {error.strerror}") from error
 
-    def _make_folder(self, folder: Path) -> None:
+    def _make_folder(self, folder: str) -> None:
         if folder not in self._known_folders:
-            folder.mkdir(parents=True, exist_ok=True)
+            os.makedirs(folder, exist_ok=True)
             self._known_folders.add(folder)
 
     def delete(self, keys: Iterable[str]) -> None:

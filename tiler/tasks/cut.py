@@ -1,7 +1,7 @@
 """From rows of a level to stored blocks: round once, cut, pad, measure, encode, store."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
@@ -15,11 +15,11 @@ from schemas.manifest import digest
 from schemas.region import Rect
 from tiler.codecs import BlockFormat, Codec, Mask, Samples
 from tiler.filters.cascade import Coverage, Values
-from tiler.samples.transfer import encode_srgb
 from tiler.stores import Store
 from tiler.tasks.destination import Destination
 from tiler.tasks.measure import measure
 from tiler.tasks.overlap import TaskWrites
+from tiler.tasks.rounding import round_samples
 
 
 @dataclass(slots=True)
@@ -62,56 +62,49 @@ class Target:
     linear_light: bool = False
 
 
-def round_samples(values: Values, coverage: Coverage | None, block: BlockFormat, linear_light: bool = False) -> tuple[Samples, Mask | None]:
-    """Round float32 ``values`` (rows, columns, channels) to the stored type, once, to nearest (ties to even), within its range.
-
-    Coverage becomes the alpha channel of imagery, or the mask of heights (True where any of the sample is covered). Colour
-    under an alpha of 0 is set to 0. Values in ``linear_light`` are encoded as sRGB first.
-    """
-    if block.dtype == "float32":
-        return values, None if coverage is None else coverage > 0
-    dtype = np.dtype(block.dtype)
-    top = np.iinfo(dtype).max
-    codes = encode_srgb(values, top) if linear_light else values
-    rounded = np.clip(np.rint(codes), 0, top).astype(dtype)
-    if not block.alpha:
-        return rounded, None
-    alpha = np.full(values.shape[:2], top, dtype) if coverage is None else np.rint(coverage * np.float32(top)).astype(dtype)
-    rounded[alpha == 0] = 0
-    return np.concatenate([rounded, alpha[..., np.newaxis]], axis=-1), None
-
-
-@dataclass(slots=True)
 class _Strip:
-    """Rounded rows of a level, from row ``top`` on, that wait for the block row ``block_y`` to be complete."""
+    """Rounded rows of a level, from row ``top`` on, that wait for the block row ``block_y`` to be complete; moved, not made anew."""
 
-    top: int
-    block_y: int
-    samples: list[Samples] = field(default_factory=list)
-    masks: list[Mask] = field(default_factory=list)
-    rows: int = 0
+    def __init__(self, top: int, block_y: int) -> None:
+        self.top, self.block_y = top, block_y
+        self.rows = 0
+        self._samples: Samples | None = None
+        self._mask: Mask | None = None
 
-    def append(self, samples: Samples, mask: Mask | None) -> None:
-        """Add rows at the bottom."""
-        self.samples.append(samples)
-        if mask is not None:
-            self.masks.append(mask)
-        self.rows += len(samples)
+    def append(self, samples: Samples, mask: Mask | None, capacity: int) -> None:
+        """Add rows at the bottom; ``capacity`` is how many rows there will be at most."""
+        end = self.rows + len(samples)
+        shape = samples.shape[1:]
+        if self._samples is None or len(self._samples) < end:
+            grown = np.empty((max(capacity, end), *shape), samples.dtype)
+            if self._samples is not None:
+                grown[: self.rows] = self._samples[: self.rows]
+            self._samples = grown
+            if self._mask is not None:
+                self._mask = np.concatenate([self._mask, np.ones((len(grown) - len(self._mask), shape[0]), np.bool_)])
+        self._samples[self.rows : end] = samples
+        if mask is not None and self._mask is None:
+            self._mask = np.ones((len(self._samples), shape[0]), np.bool_)
+        if self._mask is not None:
+            self._mask[self.rows : end] = True if mask is None else mask
+        self.rows = end
 
-    def joined(self) -> tuple[Samples, Mask | None]:
-        """Return all rows in one piece."""
-        if len(self.samples) > 1:
-            self.samples = [np.concatenate(self.samples)]
-            self.masks = [np.concatenate(self.masks)] if self.masks else []
-        return self.samples[0], self.masks[0] if self.masks else None
+    def window(self, rows: slice, columns: slice) -> tuple[Samples, Mask | None]:
+        """Return samples, contiguous, and mask, None if all are valid; rows count from ``top``."""
+        assert self._samples is not None
+        samples = np.ascontiguousarray(self._samples[rows, columns])
+        return samples, None if self._mask is None else self._mask[rows, columns]
 
     def drop_above(self, y: int) -> None:
         """Forget the rows above ``y``."""
-        samples, mask = self.joined()
         gone = max(0, y - self.top)
-        self.samples = [samples[gone:]]
-        self.masks = [] if mask is None else [mask[gone:]]
-        self.top, self.rows = self.top + gone, self.rows - gone
+        kept = max(0, self.rows - gone)
+        for held in (self._samples, self._mask):
+            if held is not None:
+                held[:kept] = held[gone : self.rows]
+        if self._mask is not None and self._mask[:kept].all():
+            self._mask = None
+        self.top, self.rows = self.top + gone, kept
 
 
 class Cutter:
@@ -150,18 +143,18 @@ class Cutter:
         strip = self._strips.get(level)
         if strip is None:
             strip = self._strips[level] = _Strip(padded.y0, core.y0 // lattice.block)
-        strip.append(*round_samples(part, covered, self._target.block, self._target.linear_light))
+        held = lattice.block + 2 * lattice.pad + len(part)
+        strip.append(*round_samples(part, covered, self._target.block, self._target.linear_light), held)
         self._cut_complete(level, strip, core, padded)
 
     def _cut_complete(self, level: int, strip: _Strip, core: Rect, padded: Rect) -> None:
         block, pad = self._target.lattice.block, self._target.lattice.pad
         while strip.block_y * block < core.y1 and strip.top + strip.rows >= min((strip.block_y + 1) * block + pad, padded.y1):
-            samples, mask = strip.joined()
             for x in range(core.x0 // block, -(-core.x1 // block)):
                 address = BlockAddress(level, x, strip.block_y)
                 seen = self._target.lattice.core(address).grown(pad) & padded
-                window = np.s_[seen.y0 - strip.top : seen.y1 - strip.top, seen.x0 - padded.x0 : seen.x1 - padded.x0]
-                self._on_block(self._finish(address, seen, samples[window], None if mask is None else mask[window]))
+                rows, columns = slice(seen.y0 - strip.top, seen.y1 - strip.top), slice(seen.x0 - padded.x0, seen.x1 - padded.x0)
+                self._on_block(self._finish(address, seen, *strip.window(rows, columns)))
             strip.block_y += 1
             strip.drop_above(strip.block_y * block - pad)
 

@@ -13,8 +13,8 @@ _SIDE: Final = 4096
 _LEAST_SIDE: Final = 2048
 _LARGEST_SIDE: Final = 16384
 """Sides of tasks [level-0 samples]. With blocks of 256, of every sample 1/256 or (2048) 1/64 is handed on as float32."""
-_TASKS_PER_WORKER: Final = 4
-"""So few tasks for every worker, and the last of them leaves the others idle for too long."""
+_TASKS_PER_WORKER: Final = 2
+"""With fewer tasks for every worker the last of them leaves the others idle for too long; more of them read and filter more halo."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,8 +37,8 @@ class PieceWriter:
         given = np.s_[rows.y0 - first : rows.y1 - first, rows.x0 - left : rows.x1 - left]
         place = np.s_[rows.y0 - self._rect.y0 : rows.y1 - self._rect.y0, rows.x0 - self._rect.x0 : rows.x1 - self._rect.x0]
         self._pixels[place][..., : self._channels] = values[given]
-        if coverage is not None:
-            self._pixels[place][..., self._channels] = coverage[given]
+        if self._pixels.shape[2] > self._channels:
+            self._pixels[place][..., self._channels] = 1 if coverage is None else coverage[given]
 
     def data(self) -> bytes:
         """Return the piece: little-endian float32 samples in row order."""
@@ -55,8 +55,8 @@ class PieceReader:
         self._channels, self._masked = channels, masked
         self._held: dict[Rect, Pixels] = {}
 
-    def read(self, window: Rect) -> tuple[Values, Coverage | None]:
-        """Return values (rows, columns, channels) and coverage of a window; pieces that end above it are forgotten."""
+    def read_lean(self, window: Rect) -> tuple[Values, Coverage | None]:
+        """Return values (rows, columns, channels) and coverage, None if it is 1, of a window; pieces that end above it are forgotten."""
         pixels = np.empty((window.height, window.width, self._channels + self._masked), np.float32)
         self._held = {rect: held for rect, held in self._held.items() if rect.y1 > window.y0}
         seen = [piece for piece in self._pieces if piece.task.piece & window]
@@ -71,4 +71,6 @@ class PieceReader:
             pixels[part.y0 - window.y0 : part.y1 - window.y0, part.x0 - window.x0 : part.x1 - window.x0] = source
         if not self._masked:
             return pixels, None
+        if (pixels[..., self._channels] == 1).all():
+            return np.ascontiguousarray(pixels[..., : self._channels]), None
         return np.ascontiguousarray(pixels[..., : self._channels]), np.ascontiguousarray(pixels[..., self._channels])

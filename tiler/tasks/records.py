@@ -84,8 +84,7 @@ class TaskRecord(Model):
             valid=sum(block.record.valid for block in finest),
             minima=[min((block.minima[n] for block in finest), default=inf) for n in channels],
             maxima=[max((block.maxima[n] for block in finest), default=-inf) for n in channels],
-            # Exact, so that the order in which tasks are added up cannot matter; a float64 is a fraction.
-            sums=[str(sum((Fraction(block.sums[n]) for block in finest), Fraction(0))) for n in channels],
+            sums=[_exact_sum([block.sums[n] for block in finest]) for n in channels],
             **fields,
         )
 
@@ -103,6 +102,13 @@ class TaskRecord(Model):
                 for x in range(rect.x0, rect.x1):
                     yield BlockAddress(level, x, y), index[number]
                     number += 1
+
+
+def _exact_sum(values: list[float]) -> str:
+    """Return the sum as a fraction: exact, so that the order in which tasks are added up cannot matter; a float64 is a fraction."""
+    if all(value.is_integer() for value in values):
+        return str(sum(map(int, values)))  # those of 8- and 16-bit imagery, 20 times as fast
+    return str(sum(map(Fraction, values), Fraction(0)))
 
 
 def _check(key: str, record: object) -> str:

@@ -124,7 +124,7 @@ class TaskWorker:
         """Return the digest of what a task of the first tier would read."""
         self._plan.source.begin()
         for window in self._portions(task, self._windows(task)[0]):
-            self._plan.source.read(window)
+            self._plan.source.read_lean(window)
         return self._plan.source.digest()
 
     def _portions(self, task: Task, whole: Rect) -> Iterator[Rect]:
@@ -179,7 +179,7 @@ class TaskWorker:
         started = perf_counter()
         for window in self._portions(work.task, whole):
             before_read = perf_counter()
-            values, coverage = samples.read(window)
+            values, coverage = samples.read_lean(window)
             times.read_s += perf_counter() - before_read
             for row in range(0, window.height, _PUSHED_ROWS):
                 rows = slice(row, row + _PUSHED_ROWS)
