@@ -8,6 +8,7 @@ smaller than the kernel.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final, Literal
 
 import numpy as np
@@ -45,6 +46,12 @@ def _antisymmetric(index: int, size: int) -> Term:
 _RULES: Final[dict[EdgeRule, Callable[[int, int], Term]]] = {"antisymmetric": _antisymmetric, "mirror": _mirror}
 
 
+@lru_cache(maxsize=256)
+def _terms(rule: EdgeRule, size: int, indices: range) -> tuple[Term, ...]:
+    """Return what lies at ``indices``; a task asks the same for every portion of rows."""
+    return tuple(_RULES[rule](index, size) for index in indices)
+
+
 def extend(
     values: NDArray[np.float32], coverage: NDArray[np.float32] | None, *, rule: EdgeRule, size: int, origin: int, indices: range
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
@@ -53,7 +60,7 @@ def extend(
     ``values`` holds the lines from ``origin`` on, among them every one that the reflections need. An extended line is as
     covered as the least covered line it is made of. Sums are taken in float64 and rounded once.
     """
-    terms = [_RULES[rule](index, size) for index in indices]
+    terms = _terms(rule, size, indices)
     source = np.array([term.source for term in terms], np.intp) - origin
     if all(term.sign == 1 and term.last == 0 for term in terms):
         return values[source], None if coverage is None else coverage[source]

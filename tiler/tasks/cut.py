@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.address import BlockAddress
 from schemas.blockindex import BLANK, BlockRecord
@@ -171,7 +170,7 @@ class Cutter:
         count, (minima, maxima, sums) = measure(samples[core], valid, samples.shape[-1] - target.block.alpha)
         if not count:
             return CutBlock(address, BLANK, (), (), ())
-        low, high = float(minima.min()), float(maxima.max())
+        low, high = min(minima.tolist()), max(maxima.tolist())
         if address.level == 0:
             self._check_range(address, low, high)
         started = perf_counter()
@@ -185,7 +184,7 @@ class Cutter:
             self.written += 1
         self.times.encode_s += encoded - started
         self.times.write_s += perf_counter() - encoded
-        return CutBlock(address, record, _floats(minima), _floats(maxima), _floats(sums))
+        return CutBlock(address, record, tuple(minima.tolist()), tuple(maxima.tolist()), tuple(sums.tolist()))
 
     def _check_range(self, address: BlockAddress, low: float, high: float) -> None:
         """Refuse source values the codec cannot hold; a value beside the end of the range by rounding is none of them."""
@@ -198,10 +197,6 @@ class Cutter:
                 f"codec {self._target.codec.spec} holds values from {limits[0]:.9g} to {limits[1]:.9g} only, but the source has "
                 f"{low:.9g} to {high:.9g} in block {address}; use another scale and offset, or lerc"
             )
-
-
-def _floats(values: NDArray[np.generic]) -> tuple[float, ...]:
-    return tuple(float(value) for value in values)
 
 
 def _completed(samples: Samples, mask: Mask | None, seen: Rect, whole: Rect, block: BlockFormat) -> tuple[Samples, Mask | None]:
