@@ -10,6 +10,7 @@ from typing import Final, NoReturn
 import click
 
 from cli.exit_codes import INTERRUPTED, STORAGE, exit_code
+from cli.startup import QuickEnd, start_lean
 from schemas.errors import ClipmapError
 
 COMMANDS: Final = {
@@ -124,6 +125,8 @@ def _terminate(number: int, frame: FrameType | None) -> NoReturn:
 
 def main() -> None:
     """Entry point of the console script."""
+    start_lean()
+    end = QuickEnd()
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _terminate)
-    sys.exit(run())
+    sys.exit(end.with_code(run()))

@@ -1,6 +1,6 @@
-"""The everyday picture codecs: ``jpeg:Q``, ``png`` and ``webp:Q``, through imagecodecs.
+"""The everyday picture codecs: ``jpeg:Q``, ``png`` and ``webp:Q``, through imagecodecs; PNG is written by ``pngfile``.
 
-Their libraries work on byte strings and release the GIL: two threads encode JPEG at 1.9 times the rate of one.
+All work on byte strings and release the GIL: two threads encode JPEG at 1.9 times the rate of one.
 """
 
 from collections.abc import Callable
@@ -12,9 +12,7 @@ import numpy as np
 
 from schemas.errors import UsageError
 from tiler.codecs import PNG_END, BlockFormat, Factory, Mask, Samples, decoding, require_picture_end
-
-_PNG_LEVEL: Final = 6
-"""zlib's own default; level 9 saves under 1 % on satellite imagery and costs three times the time."""
+from tiler.codecs.pngfile import png_file
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +57,7 @@ def _quality(parameters: str, default: int, name: str) -> int:
 
 def _jpeg(block: BlockFormat, parameters: str) -> PictureCodec:
     quality = _quality(parameters, 85, "jpeg")
-    if block.kind != "imagery" or block.alpha or block.channels not in (1, 3) or block.dtype != "uint8":
+    if block.kind == "height" or block.alpha or block.channels not in (1, 3) or block.dtype != "uint8":
         raise UsageError(f"codec jpeg holds 8-bit imagery of 1 or 3 channels without alpha, not {block}; use png")
     # Full chroma from quality 90 on, as libvips does: below it the loss by subsampling is the smaller one.
     subsampling = "444" if quality >= 90 else "420"
@@ -83,18 +81,15 @@ def _decode_png(data: bytes, out: Samples) -> None:
 def _png(block: BlockFormat, parameters: str) -> PictureCodec:
     if parameters:
         raise UsageError(f"codec png:{parameters}: png has no parameters")
-    if block.kind != "imagery" or block.dtype == "float32":
+    if block.kind == "height" or block.dtype == "float32":
         raise UsageError(f"codec png holds imagery of 8 or 16 bits, not {block}; for heights use lerc, png16 or exr")
 
-    def encode(samples: Samples) -> bytes:
-        return bytes(imagecodecs.png_encode(samples, level=_PNG_LEVEL))
-
-    return PictureCodec(block, "png", "png", "image/png", 0.0, encode, _decode_png)
+    return PictureCodec(block, "png", "png", "image/png", 0.0, png_file, _decode_png)
 
 
 def _webp(block: BlockFormat, parameters: str) -> PictureCodec:
     quality = _quality(parameters, 85, "webp")
-    if block.kind != "imagery" or block.channels not in (3, 4) or block.dtype != "uint8":
+    if block.kind == "height" or block.channels not in (3, 4) or block.dtype != "uint8":
         raise UsageError(f"codec webp holds 8-bit imagery of 3 or 4 channels, not {block}; use png")
 
     def encode(samples: Samples) -> bytes:

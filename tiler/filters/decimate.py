@@ -6,9 +6,10 @@ NaN checks stay. Sums are taken over differences to a reference sample, which ke
 no accuracy on a large offset (error at 1e7 with unit noise: 0.5 instead of 2.0).
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from tiler.compiled import compiled
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -25,7 +26,7 @@ FULL_WEIGHT = 0.9
 """Between these sums of weights the sinc takes over from the covering kernel (see ``coarsen_partial``)."""
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def _sum_pairs(
     source: Float32, low: Int64, high: Int64, row: int, column: int, weights: Float32, reference: Float32, total: Float32
 ) -> None:
@@ -60,7 +61,7 @@ def _sum_pairs(
         total[x] = reference[x] + total[x]
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def _places(first: int, offsets: Int64, channels: int) -> Int64:
     """Return (2, taps): for taps around column ``first``, which half holds them (0 even, 1 odd columns) and where it begins there."""
     places = np.empty((2, offsets.size), np.int64)
@@ -70,7 +71,7 @@ def _places(first: int, offsets: Int64, channels: int) -> Int64:
     return places
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def _in_rows(offsets: Int64) -> Int64:
     """Return (2, taps): ``offsets`` as rows, and no columns."""
     places = np.zeros((2, offsets.size), np.int64)
@@ -78,7 +79,7 @@ def _in_rows(offsets: Int64) -> Int64:
     return places
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def _coarsen_part(
     fine: Float32, first: int, column: int, low: Int64, high: Int64, weights: Float32, twin: int, start: int, size: int, coarse: Float32
 ) -> None:
@@ -93,7 +94,7 @@ def _coarsen_part(
         _sum_pairs(fine, low, high, centre, column, weights, reference, coarse[j, start : start + size])
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def coarsen_rows(fine: Float32, first: int, low: Int64, high: Int64, weights: Float32, twin: int, coarse: Float32) -> None:
     """Filter and halve along rows: ``coarse`` (m, n) from ``fine`` (rows, n).
 
@@ -105,7 +106,7 @@ def coarsen_rows(fine: Float32, first: int, low: Int64, high: Int64, weights: Fl
         _coarsen_part(fine, first, start, before, after, weights, twin, start, min(_CHUNK, width - start), coarse)
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def coarsen_rows_of_integers(fine: Integers, first: int, low: Int64, high: Int64, weights: Float32, twin: int, coarse: Float32) -> None:
     """Do what ``coarsen_rows`` does with ``fine`` (rows, n) of whole numbers, to the same bits: they become float32 on the way.
 
@@ -125,7 +126,7 @@ def coarsen_rows_of_integers(fine: Integers, first: int, low: Int64, high: Int64
         _coarsen_part(floats, first - top, 0, before, after, weights, twin, start, size, coarse)
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def _split_columns(fine: Float32, columns: int, channels: int, halves: Float32) -> None:
     """Lay the even and the odd of ``columns`` pixels apart: ``fine`` (columns * channels) to ``halves`` (2, ...)."""
     even, odd = halves[0], halves[1]
@@ -146,7 +147,7 @@ def _split_columns(fine: Float32, columns: int, channels: int, halves: Float32) 
         even[pairs * channels : (pairs + 1) * channels] = fine[(columns - 1) * channels :]
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def coarsen_columns(fine: Float32, first: int, low: Int64, high: Int64, weights: Float32, twin: int, coarse: Float32) -> None:
     """Filter and halve along columns: ``coarse`` (m, n, c) from ``fine`` (m, columns, c).
 
@@ -171,7 +172,7 @@ def coarsen_columns(fine: Float32, first: int, low: Int64, high: Int64, weights:
             _sum_pairs(halves, before, after, 0, start, weights, reference, out[start : start + size])
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def flag_partial(coverage: Float32, first_row: int, first_column: int, offsets: Int64, flags: Flags) -> int:
     """Set ``flags`` (m, n) to 1 where any sample under the taps has a coverage below 1; return how many were set.
 
@@ -202,7 +203,7 @@ def flag_partial(coverage: Float32, first_row: int, first_column: int, offsets: 
     return count
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def _weight(coverage: Float32, row: int, column: int, offsets: Int64, weights: Float64) -> float:
     """Sum of separable weights times coverage around (row, column)."""
     total = 0.0
@@ -212,7 +213,7 @@ def _weight(coverage: Float32, row: int, column: int, offsets: Int64, weights: F
     return total
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def _peak(coverage: Float32, row: int, column: int, offsets: Int64) -> float:
     """Largest coverage under the taps around (row, column)."""
     largest = 0.0
@@ -222,7 +223,7 @@ def _peak(coverage: Float32, row: int, column: int, offsets: Int64) -> float:
     return largest
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def _moment(
     fine: Float32, channel: int, reference: float, coverage: Float32, row: int, column: int, offsets: Int64, weights: Float64
 ) -> float:
@@ -235,7 +236,7 @@ def _moment(
     return total
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def coarsen_partial(
     fine: Float32,
     coverage: Float32,
@@ -280,7 +281,7 @@ def coarsen_partial(
                 coarse[j, i, channel] = np.float32(mean + detail)
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def _range_of_rows(fine: Float32, coverage: Float32, centre: int, offsets: Int64, inside: Bounds, low: Float32, high: Float32) -> None:
     """Set ``low`` and ``high`` (columns, c) to the range of each column of ``fine`` over the taps around row ``centre``."""
     low[:] = np.float32(np.inf)
@@ -298,7 +299,7 @@ def _range_of_rows(fine: Float32, coverage: Float32, centre: int, offsets: Int64
                 high[x, channel] = max(high[x, channel], fine[y, x, channel])
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def clamp_to_support(
     fine: Float32, coverage: Float32, first_row: int, first_column: int, offsets: Int64, inside: Bounds, coarse: Float32
 ) -> None:

@@ -47,9 +47,13 @@ _RULES: Final[dict[EdgeRule, Callable[[int, int], Term]]] = {"antisymmetric": _a
 
 
 @lru_cache(maxsize=256)
-def _terms(rule: EdgeRule, size: int, indices: range) -> tuple[Term, ...]:
-    """Return what lies at ``indices``; a task asks the same for every portion of rows."""
-    return tuple(_RULES[rule](index, size) for index in indices)
+def _terms(rule: EdgeRule, size: int, indices: range) -> tuple[tuple[Term, ...], NDArray[np.intp], bool]:
+    """Return what lies at ``indices``, which lines that are, and whether it is these lines as they are.
+
+    Remembered, as a task asks the same for every portion of rows.
+    """
+    terms = tuple(_RULES[rule](index, size) for index in indices)
+    return terms, np.array([term.source for term in terms], np.intp), all(term.sign == 1 and term.last == 0 for term in terms)
 
 
 def extend(
@@ -60,9 +64,9 @@ def extend(
     ``values`` holds the lines from ``origin`` on, among them every one that the reflections need. An extended line is as
     covered as the least covered line it is made of. Sums are taken in float64 and rounded once.
     """
-    terms = _terms(rule, size, indices)
-    source = np.array([term.source for term in terms], np.intp) - origin
-    if all(term.sign == 1 and term.last == 0 for term in terms):
+    terms, lines, are_plain = _terms(rule, size, indices)
+    source = lines - origin
+    if are_plain:
         return values[source], None if coverage is None else coverage[source]
     total = np.array([term.sign for term in terms], np.float64)[:, np.newaxis, np.newaxis] * values[source]
     covered = None if coverage is None else coverage[source]

@@ -24,12 +24,12 @@ from importlib import import_module
 from itertools import product
 from typing import Any, Final
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import MissingExtraError, UsageError
 from schemas.region import Rect
+from tiler.compiled import compiled
 from tiler.sources.convert import DerivedSource, SampleSource
 
 Float32 = NDArray[np.float32]
@@ -182,7 +182,7 @@ class EnhancedSource(DerivedSource):
         amplify(values, *seen, planes, smooth[0], smooth[1], smooth[2], coverage is not None, self._gain - 1, self._top, out)
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def weigh(values: Float32, coverage: Float32, masked: bool, rows: Indices, columns: Indices, top: float, planes: Float64) -> None:
     """Put samples times weight, and the weight, into ``planes`` (channels + 1, rows, columns): both so coarse that sums are exact."""
     for v in range(rows.size):
@@ -199,7 +199,7 @@ def weigh(values: Float32, coverage: Float32, masked: bool, rows: Indices, colum
                 planes[channel, v, u] = weight * (np.rint(value * GRID) / GRID)
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def amplify(
     values: Float32,
     rows: Indices,

@@ -6,17 +6,17 @@ what lies within ``across`` of it only, and the result does not depend on how th
 except where a line cuts off a corner of it.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.region import Rect
+from tiler.compiled import compiled
 from tiler.sources.convert import DerivedSource, SampleSource
 
 Float32 = NDArray[np.float32]
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def _steps_to_valid(coverage: Float32, y: int, x: int, dy: int, dx: int, across: int) -> int:
     """Return the number of steps from (y, x) to the first valid sample in a direction, 0 if there is none within ``across``."""
     for step in range(1, across + 1):
@@ -28,7 +28,7 @@ def _steps_to_valid(coverage: Float32, y: int, x: int, dy: int, dx: int, across:
     return 0
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def fill_voids(values: Float32, coverage: Float32, across: int, inner: tuple[int, int, int, int], out: Float32, covered: Float32) -> int:
     """Fill the voids of ``values`` (rows, columns) in rows and columns ``inner`` = (y0, y1, x0, x1) into ``out`` and ``covered``.
 

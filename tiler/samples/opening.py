@@ -5,15 +5,12 @@ from pathlib import Path
 
 from schemas.errors import UsageError
 from schemas.settings import BuildSettings
-from tiler.samples.enhance import EnhancedSource, parse_enhancement
-from tiler.samples.fill import FilledSource
 from tiler.samples.stretch import Ranges, StretchedSource, find_ranges, parse_stretch
 from tiler.samples.transfer import LinearLight
 from tiler.sources import Reader
 from tiler.sources.convert import SampleSource, Source, choose_conversion
 from tiler.sources.disguise import refuse_disguised_heights
 from tiler.sources.files import open_file
-from tiler.sources.mosaic import open_mosaic
 
 KnownRanges = Callable[[SampleSource], Ranges | None]
 """Tells what an earlier pass over the same source found for the same stretch; None if there was none."""
@@ -39,6 +36,8 @@ def open_samples(
 
 def _open(sources: Sequence[Path], scratch: Path | None, settings: BuildSettings) -> Reader:
     if settings.mosaic:
+        from tiler.sources.mosaic import open_mosaic  # noqa: PLC0415 - 12 ms of every start, for rasterio's warping
+
         return open_mosaic(
             sources,
             scratch,
@@ -65,8 +64,12 @@ def _prepared(source: SampleSource, settings: BuildSettings, workers: int, known
     if settings.fill:
         if source.conversion.kind != "height":
             raise UsageError("--fill is for heights; voids of imagery stay transparent")
+        from tiler.samples.fill import FilledSource  # noqa: PLC0415 - as below
+
         source = FilledSource(source, settings.fill)
     if settings.enhance is not None:
+        from tiler.samples.enhance import EnhancedSource, parse_enhancement  # noqa: PLC0415 - 4 ms of every start, used by few
+
         source = EnhancedSource(source, parse_enhancement(settings.enhance))
     if settings.linear_light:
         if source.conversion.kind != "imagery":

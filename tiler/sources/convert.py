@@ -168,9 +168,10 @@ class Source:
     def _pixels(self, window: Rect) -> tuple[Pixels, NDArray[np.uint8] | None]:
         pixels, mask = self._reader.read(window)
         for part, hasher in zip((pixels, mask), getattr(self._local, "hashers", ()), strict=False):
-            # As the file has them: a quarter of the bytes that the same samples take as float32. By rows, or a window would be copied.
-            for row in () if part is None else part if part[0].flags.c_contiguous else np.ascontiguousarray(part):
-                hasher.update(row)
+            if part is not None:
+                # As the file has them: a quarter of the bytes that the same samples take as float32. In one piece: by rows, which
+                # would need no copy, threads get into each other's way, as each row frees Python's lock and takes it again.
+                hasher.update(np.ascontiguousarray(part))
         return pixels, mask
 
     def _converted(self, pixels: Pixels, mask: NDArray[np.uint8] | None) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:

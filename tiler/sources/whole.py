@@ -1,11 +1,12 @@
 """Heights without voids, taken over in one pass: most elevation models declare or allow voids and have none in most places."""
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from tiler.compiled import compiled
 
-@numba.njit(nogil=True, cache=True)
+
+@compiled
 def _take_whole(
     heights: NDArray[np.float32], bits: NDArray[np.int32], limit: np.int32, void: np.float32, taken: NDArray[np.float32]
 ) -> bool:
@@ -31,5 +32,5 @@ def take_whole(heights: NDArray[np.float32], nodata: float | None, limit: float)
     rows = np.ascontiguousarray(heights)
     taken = np.empty(rows.shape, np.float32)
     void = np.float32(np.nan) if nodata is None else np.float32(nodata)
-    bound = np.array(limit, np.float32).view(np.int32)[()]
+    bound = np.float32(limit).view(np.int32)
     return taken if _take_whole(rows, rows.view(np.int32), bound, void, taken) else None

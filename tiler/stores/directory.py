@@ -68,7 +68,7 @@ class DirectoryStore:
         """Put ``data`` under ``key`` in one step; raises StorageError."""
         # Strings instead of Path objects: a build writes thousands of files a second, and every thread waits for this one meanwhile.
         *folders, name = check_key(self.location, key)
-        folder = os.path.join(self._folder, *folders)
+        folder = "/".join((self._folder, *folders))
         temporary = f"{folder}/{_TEMPORARY}{os.getpid()}-{threading.get_ident()}-{name}"
         try:
             self._make_folder(folder)

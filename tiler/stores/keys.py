@@ -8,12 +8,12 @@ def check_key(location: str, key: str) -> list[str]:
 
     So no key leads out of a store, none means two things, and what is hidden (``.x``: locks, unfinished files) is out of reach.
     """
-    parts = key.split("/")
-    if "\0" in key or any(not part or part.startswith(".") for part in parts):
+    if "\0" in key or not is_key(key):
         raise NotFoundError(f"{location}: {key!r} is not a key of a store")
-    return parts
+    return key.split("/")
 
 
 def is_key(key: str) -> bool:
     """Whether a listed name is a key: no part of it is hidden or empty."""
-    return all(part and not part.startswith(".") for part in key.split("/"))
+    framed = f"/{key}/"
+    return "//" not in framed and "/." not in framed

@@ -62,10 +62,14 @@ class Target:
 
 
 class _Strip:
-    """Rounded rows of a level, from row ``top`` on, that wait for the block row ``block_y`` to be complete; moved, not made anew."""
+    """Rounded rows of a level, from row ``top`` on, that wait for the block row ``block_y`` to be complete; moved, not made anew.
 
-    def __init__(self, top: int, block_y: int) -> None:
-        self.top, self.block_y = top, block_y
+    ``whole`` are the samples of the level, ``core`` those of the task's blocks, ``padded`` those with what of their pad there is.
+    """
+
+    def __init__(self, whole: Rect, core: Rect, padded: Rect, block_y: int) -> None:
+        self.whole, self.core, self.padded = whole, core, padded
+        self.top, self.block_y = padded.y0, block_y
         self.rows = 0
         self._samples: Samples | None = None
         self._mask: Mask | None = None
@@ -133,48 +137,56 @@ class Cutter:
     def take(self, level: int, first: int, values: Values, coverage: Coverage | None, left: int) -> None:
         """Take rows ``first`` and following of ``level``, whose first column is ``left``."""
         lattice = self._target.lattice
-        core = self._core.coarsened(level - self._first_level)
-        padded = core.grown(lattice.pad) & lattice.level_rect(level)
+        strip = self._strips.get(level)
+        if strip is None:
+            core = self._core.coarsened(level - self._first_level)
+            whole = lattice.level_rect(level)
+            strip = self._strips[level] = _Strip(whole, core, core.grown(lattice.pad) & whole, core.y0 // lattice.block)
+        padded = strip.padded
         rows, columns = slice(max(padded.y0 - first, 0), max(padded.y1 - first, 0)), slice(padded.x0 - left, padded.x1 - left)
         part, covered = values[rows, columns], None if coverage is None else coverage[rows, columns]
         if not len(part):
             return
-        strip = self._strips.get(level)
-        if strip is None:
-            strip = self._strips[level] = _Strip(padded.y0, core.y0 // lattice.block)
         held = lattice.block + 2 * lattice.pad + len(part)
         strip.append(*round_samples(part, covered, self._target.block, self._target.linear_light), held)
-        self._cut_complete(level, strip, core, padded)
+        self._cut_complete(level, strip)
 
-    def _cut_complete(self, level: int, strip: _Strip, core: Rect, padded: Rect) -> None:
+    def _cut_complete(self, level: int, strip: _Strip) -> None:
         block, pad = self._target.lattice.block, self._target.lattice.pad
+        core, padded = strip.core, strip.padded
         while strip.block_y * block < core.y1 and strip.top + strip.rows >= min((strip.block_y + 1) * block + pad, padded.y1):
+            top = strip.block_y * block
             for x in range(core.x0 // block, -(-core.x1 // block)):
-                address = BlockAddress(level, x, strip.block_y)
-                seen = self._target.lattice.core(address).grown(pad) & padded
+                whole = Rect(x * block - pad, top - pad, (x + 1) * block + pad, top + block + pad)
+                seen = whole & padded
                 rows, columns = slice(seen.y0 - strip.top, seen.y1 - strip.top), slice(seen.x0 - padded.x0, seen.x1 - padded.x0)
-                self._on_block(self._finish(address, seen, *strip.window(rows, columns)))
+                samples, mask = strip.window(rows, columns)
+                own = whole.grown(-pad) & strip.whole if pad or seen != whole else whole
+                self._on_block(self._finish(BlockAddress(level, x, strip.block_y), whole, seen, own, samples, mask))
             strip.block_y += 1
             strip.drop_above(strip.block_y * block - pad)
 
-    def _finish(self, address: BlockAddress, seen: Rect, samples: Samples, mask: Mask | None) -> CutBlock:
-        """Measure the core, encode core and pad, store; ``samples`` are those of ``seen``, what of the padded block the level has."""
+    def _finish(self, address: BlockAddress, whole: Rect, seen: Rect, own: Rect, samples: Samples, mask: Mask | None) -> CutBlock:
+        """Measure ``own``, the core's samples, encode ``whole``, the padded block, store; ``samples`` are those of ``seen``, its part."""
         target = self._target
-        own = target.lattice.valid_core(address).shifted(-seen.x0, -seen.y0)
-        core = np.s_[own.y0 : own.y1, own.x0 : own.x1]
         if address.level and target.codec.value_range is not None:
             # What the filter overshot is clipped; it is measured as readers will see it.
             lowest, highest = target.codec.value_range
             samples = np.clip(samples, np.float32(lowest), np.float32(highest))
-        valid = samples[core][..., -1] > 0 if target.block.alpha else None if mask is None else mask[core]
-        count, (minima, maxima, sums) = measure(samples[core], valid, samples.shape[-1] - target.block.alpha)
+        core, valid = samples, mask
+        if own != seen:
+            place = np.s_[own.y0 - seen.y0 : own.y1 - seen.y0, own.x0 - seen.x0 : own.x1 - seen.x0]
+            core, valid = samples[place], None if mask is None else mask[place]
+        if target.block.alpha:
+            valid = core[..., -1] > 0
+        count, found = measure(core, valid, samples.shape[-1] - target.block.alpha)
         if not count:
             return CutBlock(address, BLANK, (), (), ())
-        low, high = min(minima.tolist()), max(maxima.tolist())
+        minima, maxima, sums = map(tuple, found.tolist())
+        low, high = min(minima), max(maxima)
         if address.level == 0:
             self._check_range(address, low, high)
         started = perf_counter()
-        whole = target.lattice.core(address).grown(target.lattice.pad)
         data = target.codec.encode(*_completed(samples, mask, seen, whole, target.block))
         encoded = perf_counter()
         record = BlockRecord(digest(data), len(data), count, low, high)
@@ -184,7 +196,7 @@ class Cutter:
             self.written += 1
         self.times.encode_s += encoded - started
         self.times.write_s += perf_counter() - encoded
-        return CutBlock(address, record, tuple(minima.tolist()), tuple(maxima.tolist()), tuple(sums.tolist()))
+        return CutBlock(address, record, minima, maxima, sums)
 
     def _check_range(self, address: BlockAddress, low: float, high: float) -> None:
         """Refuse source values the codec cannot hold; a value beside the end of the range by rounding is none of them."""

@@ -2,12 +2,18 @@
 
 from fractions import Fraction
 from math import inf
+from typing import Final
 
-from schemas.blockindex import RECORD_BYTES, pack_record
+import numpy as np
+from numpy.typing import NDArray
+
 from schemas.lattice import Lattice
 from schemas.manifest import Level, Statistics, digest, pack_bitmap
 from tiler.tasks.partition import Task
 from tiler.tasks.records import TaskRecord
+
+_RECORD: Final = np.dtype([("digest", "V16"), ("length_bytes", "<u4"), ("valid", "<u4"), ("min", "<f4"), ("max", "<f4")])
+"""An entry of a block index, as ``schemas.blockindex`` has it."""
 
 
 class Ledger:
@@ -15,23 +21,18 @@ class Ledger:
 
     def __init__(self, lattice: Lattice, colours: int) -> None:
         self._lattice = lattice
-        counts = [columns * rows for columns, rows in map(lattice.block_counts, range(lattice.levels))]
-        self._records = [bytearray(count * RECORD_BYTES) for count in counts]
-        self._stored = [bytearray(-(-count // 8)) for count in counts]
-        self._stored_bytes = [0] * lattice.levels
+        shapes = [(rows, columns) for columns, rows in map(lattice.block_counts, range(lattice.levels))]
+        self._records = [np.zeros(shape, _RECORD) for shape in shapes]
         self._minima, self._maxima = [inf] * colours, [-inf] * colours
         self._sums = [Fraction(0)] * colours
         self._valid = 0
 
     def enter(self, task: Task, record: TaskRecord) -> None:
         """Enter one finished task."""
-        for address, block in record.entries(task, self._lattice.block):
-            if block.blank:
-                continue
-            level, place = address.level, self._lattice.block_number(address)
-            self._records[level][place * RECORD_BYTES : (place + 1) * RECORD_BYTES] = pack_record(block)
-            self._stored[level][place // 8] |= 1 << place % 8
-            self._stored_bytes[level] += block.length_bytes
+        entries = np.frombuffer(record.index().data, _RECORD)
+        for level, blocks in task.blocks(self._lattice.block):
+            part, entries = entries[: blocks.area], entries[blocks.area :]
+            self._records[level][blocks.y0 : blocks.y1, blocks.x0 : blocks.x1] = part.reshape(blocks.height, blocks.width)
         if record.valid:
             self._minima = list(map(min, self._minima, record.minima))
             self._maxima = list(map(max, self._maxima, record.maxima))
@@ -40,17 +41,21 @@ class Ledger:
 
     def index(self, level: int) -> bytes:
         """Return the bytes of the block index of ``level``."""
-        return bytes(self._records[level])
+        return self._records[level].tobytes()
+
+    def _is_stored(self, level: int) -> NDArray[np.bool_]:
+        stored: NDArray[np.bool_] = self._records[level]["length_bytes"] > 0
+        return stored
 
     def stored(self, level: int) -> bytes:
         """Return the bitmap of the blocks of ``level`` that are stored: row order, lowest bit first."""
-        return bytes(self._stored[level])
+        return np.packbits(self._is_stored(level), bitorder="little").tobytes()
 
     def level(self, level: int) -> Level:
         """Return the manifest's entry for ``level``."""
         width, height = self._lattice.level_size(level)
         columns, rows = self._lattice.block_counts(level)
-        stored = int.from_bytes(self._stored[level], "little").bit_count()
+        stored = int(self._is_stored(level).sum())
         return Level(
             level=level,
             width=width,
@@ -59,9 +64,9 @@ class Ledger:
             rows=rows,
             stored=stored,
             blank=columns * rows - stored,
-            stored_bytes=self._stored_bytes[level],
-            availability=pack_bitmap(bytes(self._stored[level]), columns * rows),
-            index=digest(self._records[level]),
+            stored_bytes=int(self._records[level]["length_bytes"].sum(dtype=np.int64)),
+            availability=pack_bitmap(self.stored(level), columns * rows),
+            index=digest(self.index(level)),
         )
 
     def statistics(self) -> Statistics:

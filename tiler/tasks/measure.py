@@ -2,12 +2,13 @@
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from tiler.compiled import compiled
 
-@numba.njit(nogil=True, cache=True)
+
+@compiled
 def _measure_valid(samples: NDArray[Any], valid: NDArray[np.bool_], found: NDArray[np.float64]) -> int:
     """Put minimum, maximum and sum per channel of the valid samples into ``found`` (3, channels); return how many are valid."""
     rows, columns = samples.shape[:2]
@@ -29,7 +30,7 @@ def _measure_valid(samples: NDArray[Any], valid: NDArray[np.bool_], found: NDArr
     return count
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def _measure_whole(
     samples: NDArray[Any], lows: NDArray[Any], highs: NDArray[Any], sums: NDArray[Any], count: int, found: NDArray[np.float64]
 ) -> None:

@@ -18,7 +18,7 @@ from schemas.address import BlockAddress
 from schemas.blockindex import RECORD_BYTES, BlockIndex, BlockRecord, pack_record
 from schemas.errors import NotFoundError
 from schemas.manifest import Digest, Model, digest
-from schemas.settings import BuildSettings
+from schemas.settings import BuildSettings, LightSettings
 from tiler.sources import Layout
 from tiler.stores import Store
 from tiler.tasks.cut import CutBlock
@@ -46,6 +46,7 @@ class PlanRecord(Model):
     sources: list[str] = Field(description="Absolute paths of the source files, in the order in which they were given")
     stamps: list[str] = Field(description="State of every source file: path, size and time of change; empty while an update is published")
     settings: BuildSettings
+    light: LightSettings | None = Field(default=None, description="What light is simulated, if the layer is one of light")
     ranges: list[tuple[float, float]] = Field(default=[], description="What a stretch found to become 0 to 255, per channel")
 
     def explain(self, signature: dict[str, JsonValue], ignored: Collection[str] = ()) -> str:

@@ -2,16 +2,16 @@
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from tiler.codecs import BlockFormat, Mask, Samples
+from tiler.compiled import compiled
 from tiler.filters.cascade import Coverage, Values
 from tiler.samples.transfer import encode_srgb
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def _round(values: NDArray[np.float32], top: np.float32, rounded: NDArray[Any]) -> None:
     """Set ``rounded`` (rows, columns, channels) to ``values``, to nearest with ties to even, from 0 to ``top``; one pass, no copies."""
     rows, columns, channels = values.shape
