@@ -11,6 +11,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PYTHON ?=
 PYTEST_ARGS ?=
+BENCH_ARGS ?=
 DEMO ?= demo
 
 # Debian packages. Headless rendering needs EGL and OpenGL by their sonames and a driver: Mesa's software rasteriser will do.
@@ -40,12 +41,8 @@ lint: $(VENV)/.installed ## style, types and import directions
 	exit $$status
 
 .PHONY: bench
-bench: $(VENV)/.installed ## time per stage of a build; raw results in tests/bench/results
-	@$(BIN)/python tests/bench/stages.py
-
-.PHONY: bench-peers
-bench-peers: $(VENV)/.installed ## clipmap beside vips, GDAL and OpenImageIO: writes the tables of docs/PERFORMANCE.md
-	@$(BIN)/python tests/bench/peers.py
+bench: $(VENV)/.installed ## clipmap beside vips, GDAL and OpenImageIO, half an hour: writes the tables of docs/PERFORMANCE.md
+	@$(BIN)/python tests/bench/peers.py $(BENCH_ARGS)
 
 .PHONY: docs
 docs: $(VENV)/.installed ## write the generated parts of docs/ anew

@@ -1,144 +1,132 @@
 """Builds the same pyramids with clipmap and with other programs, in turn, and says what each costs.
 
-    python tests/bench/peers.py [--size 8192] [--runs 5] [--only 'jpeg.*(clipmap|vips)'] [--merge]
-    python tests/bench/peers.py --report
+    python tests/bench/peers.py                                  # everything: about half an hour on two processors
+    python tests/bench/peers.py --only '^png: ' --merge          # one case anew, the others as they were
+    python tests/bench/peers.py --only '^(limits|errors)' --merge
+    python tests/bench/peers.py --size 2048 --runs 2 --scratch   # a trial: no results, no report
+    python tests/bench/peers.py --report                         # only write docs/PERFORMANCE.md
 
-Sources are made here: the picture of ``stages.py``, and heights of a known spectrum. A round runs every program of a case once,
-A B C A B C; the first round warms caches (kernels, pages) and is not counted. Programs that are not installed are named and left out.
-Results go to ``tests/bench/results/peers-SIZE.csv`` and ``.json``; then, or with ``--report`` alone, the tables and the picture of
-``docs/PERFORMANCE.md`` are written from all results. Debian: ``apt-get install libvips-tools gdal-bin python3-gdal openimageio-tools``.
+Cases are jpeg, jpeg-small, heights, png, workers, layouts and growth; besides, errors (of the coarse levels) and limits (of the machine).
+Sources are made here. A round runs every program of a case once, A B C A B C, after one round on small sources that is not counted.
+Every output is kept until the end, see ``peers_room.py``: with the default size that takes some 40 GB. Programs that are not installed are
+named and left out. Results go to ``tests/bench/results/peers.json``, ``peers.csv`` and ``peers-errors.csv``; then the generated parts
+and the pictures of ``docs/PERFORMANCE.md`` are written. Debian: ``apt-get install libvips-tools gdal-bin python3-gdal openimageio-tools``.
 """
 
 import argparse
 import csv
 import json
-import os
 import re
-import shutil
+import signal
 import sys
 import tempfile
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-import rasterio
-from affine import Affine
-from numpy.typing import NDArray
-
-from tests.bench.peers_cost import run_command
+from tests.bench.peers_cost import CommandError
+from tests.bench.peers_errors import check_box, measure_errors
 from tests.bench.peers_limits import limits
-from tests.bench.peers_programs import Program, Source, programs, versions
-from tests.bench.peers_report import write_report
-from tests.bench.stages import PERIOD, RESULTS, machine, natural_picture, write_source
+from tests.bench.peers_measure import run_case
+from tests.bench.peers_programs import cases, versions
+from tests.bench.peers_report import RAW, write_report
+from tests.bench.peers_room import Room
+from tests.bench.peers_tables import Result
+from tests.bench.peers_targets import targets
 
-STAGES: Final = ("read", "filter", "encode", "write")
-
-
-def terrain(side: int, seed: int = 2) -> NDArray[np.float32]:
-    """Return heights (side, side) in metres, float32, without a seam; amplitudes fall as 1/f^2, deviation 400 m."""
-    random = np.random.default_rng(seed)
-    frequency = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None, :])
-    frequency[0, 0] = np.inf
-    heights = np.fft.irfft2(np.fft.rfft2(random.standard_normal((side, side))) / frequency**2, s=(side, side))
-    return np.asarray(1000 + heights * (400 / heights.std()), np.float32)
+MOST_ERROR_SIDE: Final = 4096
+"""Side of the sources whose coarse levels are compared: the references are float64 and slow."""
 
 
-def write_heights(path: Path, side: int) -> None:
-    """Write a georeferenced float32 TIFF of ``side`` by ``side`` heights in 512 x 512 tiles."""
-    period = min(PERIOD, side)
-    heights = terrain(period)
-    profile = {"driver": "GTiff", "width": side, "height": side, "count": 1, "dtype": "float32"}
-    tiles = {"tiled": True, "blockxsize": 512, "blockysize": 512}
-    with rasterio.open(path, "w", crs="EPSG:32633", transform=Affine(1, 0, 500000, 0, -1, 5000000), **profile, **tiles) as file:
-        for row in range(0, side, period):
-            for column in range(0, side, period):
-                part = heights[: min(period, side - row), : min(period, side - column)]
-                file.write(part, 1, window=rasterio.windows.Window(column, row, part.shape[1], part.shape[0]))
-
-
-def run_once(program: Program, source: Path, folder: Path) -> dict[str, Any]:
-    """Run a program into a fresh folder, which is removed, and return its cost, with the stages where it is clipmap."""
-    output = folder / "output"
-    output.mkdir()
-    (output / "link.tif").symlink_to(source)
-    try:
-        cost, printed = run_command(program.line(source, output), output)
-    finally:
-        shutil.rmtree(output)
-    row: dict[str, Any] = asdict(cost)
-    if printed.startswith("{"):
-        report = json.loads(printed)
-        row["build_s"] = report["wall_s"]
-        row |= {f"{stage}_s_per_megasample": report["thread_seconds_per_megasample"][stage] for stage in STAGES}
-    return row
-
-
-def measure(size: int, runs: int, only: str) -> dict[str, Any]:
-    """Make the sources, run every program in turn and return all figures."""
-    result: dict[str, Any] = {"size": size, "machine": machine(), "versions": versions(), "load": [os.getloadavg()[0]], "rows": []}
-    with tempfile.TemporaryDirectory(prefix="clipmap-peers-") as name:
-        folder = Path(name)
-        paths: dict[Source, Path] = {"rgb": folder / "rgb.tif", "height": folder / "height.tif"}
-        write_source(paths["rgb"], size)
-        write_heights(paths["height"], size)
-        for kind, several in programs(size).items():
-            chosen = [program for program in several if re.search(only, f"{program.case}: {program.name}", re.IGNORECASE)]
+def measure(size: int, runs: int, only: str, place: Path, keep: Callable[[Result], None]) -> Result:
+    """Make the sources, measure what ``only`` finds, and return all figures; ``keep`` is given what there is after every part."""
+    result: Result = {"size": size, "versions": versions(), "cases": {}}
+    with Room(place) as room:
+        for case in cases(size):
+            chosen = [program for program in case.programs if re.search(only, f"{case.key}: {program.name}")]
             for missing in sorted({program.command[0] for program in chosen if not program.installed}):
-                sys.stderr.write(f"{missing} is not installed: left out\n")
-            run_case([program for program in chosen if program.installed], paths[kind], folder, runs, result)
-        result["limits"] = limits(folder, natural_picture(1024), terrain(1024)[..., np.newaxis], paths["rgb"])
+                sys.stderr.write(f"{case.key}: {missing} is not installed: left out\n")
+            present = [program for program in chosen if program.installed]
+            if present:
+                result["cases"][case.key] = run_case(case, present, runs, room)
+                keep(result)
+        if re.search(only, "errors: "):
+            side = min(MOST_ERROR_SIDE, size)
+            result["errors"] = [row for kind in ("rgb", "height") for row in measure_errors(kind, side, room)]
+            result["box"] = check_box(side, room)
+            keep(result)
+        if re.search(only, "limits: "):
+            result["limits"] = limits(room, size)  # at the end: for half an hour nothing was deleted here
+            keep(result)
     return result
 
 
-def run_case(chosen: list[Program], source: Path, folder: Path, runs: int, result: dict[str, Any]) -> None:
-    """Add the runs of all programs that take the same source to ``result``, case by case, so that a round is short."""
-    for case in dict.fromkeys(program.case for program in chosen):
-        of_case = [program for program in chosen if program.case == case]
-        for number in range(-1, runs):
-            for program in of_case:
-                if number >= (program.runs or runs):
-                    continue
-                cost = run_once(program, source, folder)
-                if number < 0:
-                    continue
-                same = {"case": case, "program": program.name, "filter": program.filter, "remark": program.remark, "run": number}
-                result["rows"].append(same | cost)
-                sys.stderr.write(f"{case}: {program.name}: {cost['wall_s']:.2f} s\n")
-            result["load"].append(os.getloadavg()[0])
+def merged(old: Result, new: Result) -> Result:
+    """Return ``old`` with everything that was measured anew in its place, cases as a whole; raises SystemExit if sizes differ."""
+    if old["size"] != new["size"]:
+        raise SystemExit(f"{RAW}: has results of --size {old['size']}, which --merge cannot mix with those of {new['size']}")
+    both = old["cases"] | new["cases"]
+    ordered = {case.key: both[case.key] for case in cases(new["size"]) if case.key in both}
+    return old | new | {"cases": ordered}
 
 
-def save(result: dict[str, Any], merge: bool) -> None:
-    """Write all figures as JSON and a line per run as CSV; ``merge`` keeps the cases in the old files that were not measured now."""
-    RESULTS.mkdir(exist_ok=True)
-    stem = RESULTS / f"peers-{result['size']}"
-    if merge and stem.with_suffix(".json").exists():
-        measured = {row["case"] for row in result["rows"]}
-        old = json.loads(stem.with_suffix(".json").read_text())
-        result["rows"] = [row for row in old["rows"] if row["case"] not in measured] + result["rows"]
-        result["load"] = old["load"] + result["load"]
-    order = [program.case for several in programs(result["size"]).values() for program in several]
-    result["rows"].sort(key=lambda row: order.index(row["case"]))
-    stem.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
-    names = list(dict.fromkeys(name for row in result["rows"] for name in row))
-    with open(stem.with_suffix(".csv"), "w", newline="") as file:
+def write_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write one line per row as CSV."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    with open(path, "w", newline="") as file:
         writer = csv.DictWriter(file, names, lineterminator="\n")
         writer.writeheader()
-        writer.writerows(result["rows"])
+        writer.writerows(rows)
+
+
+def save(result: Result) -> None:
+    """Write all figures as JSON, a line per run as CSV, and a line per error."""
+    RAW.parent.mkdir(exist_ok=True)
+    partial = RAW.with_suffix(".part")
+    partial.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    partial.replace(RAW)
+    rows = [row | {"source": row["source"]["layout"]} for case in result["cases"].values() for row in case["rows"]]
+    write_rows(RAW.with_suffix(".csv"), rows)
+    write_rows(RAW.with_name("peers-errors.csv"), result.get("errors", []))
+
+
+def options_of_user() -> argparse.Namespace:
+    """Return the options of the command line; ends with a message if they make no sense."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--size", type=int, default=16384, help="side of the large sources [samples], a power of two from 1024 on")
+    parser.add_argument("--runs", type=int, default=5, help="counted rounds; some cases and slow programs have fewer")
+    parser.add_argument("--only", default="", metavar="REGEX", help="measure only what this finds in 'case: program'")
+    parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()), help="where sources and outputs go; /dev/shm: no disk")
+    parser.add_argument("--merge", action="store_true", help="keep the cases of an earlier measurement that are not measured now")
+    parser.add_argument("--scratch", action="store_true", help="print all figures as JSON, write no results and no report")
+    parser.add_argument("--report", action="store_true", help="measure nothing, write docs/PERFORMANCE.md from the results")
+    options = parser.parse_args()
+    if options.size < 1024 or options.size & (options.size - 1) or options.runs < 1 or not options.folder.is_dir():
+        parser.error("--size is a power of two from 1024 on, --runs at least 1, --folder a folder that exists")
+    return options
 
 
 def main() -> None:
-    """Read the options, measure, save, and write the report."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--size", type=int, default=8192, help="side of the sources [samples]")
-    parser.add_argument("--runs", type=int, default=5, help="counted rounds; slow programs take part in fewer")
-    parser.add_argument("--only", default="", help="measure only what this regular expression finds in 'case: program'")
-    parser.add_argument("--merge", action="store_true", help="keep the cases of an earlier measurement that are not measured now")
-    parser.add_argument("--report", action="store_true", help="measure nothing, write docs/PERFORMANCE.md from the results")
-    options = parser.parse_args()
+    """Measure, save after every part, and write the report."""
+    options = options_of_user()
+    old = json.loads(RAW.read_text(encoding="utf-8")) if options.merge and RAW.exists() else None
+    if old and not options.report:
+        merged(old, {"size": options.size, "cases": {}})  # refuses before half an hour is spent
+
+    def keep(result: Result) -> None:
+        if not options.scratch:
+            save(merged(old, result) if old else result)
+
     if not options.report:
-        save(measure(options.size, options.runs, options.only), options.merge)
-    write_report(RESULTS)
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # the default would leave all outputs on the disk
+        try:
+            result = measure(options.size, options.runs, options.only, options.folder, keep)
+        except CommandError as failure:
+            raise SystemExit(str(failure)) from failure
+        if options.scratch:
+            sys.stdout.write(json.dumps(result, indent=1) + "\n")
+            return
+    sys.stderr.write(f"{targets(write_report())}\n")
 
 
 if __name__ == "__main__":

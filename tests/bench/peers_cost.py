@@ -12,6 +12,10 @@ PERIOD_S: Final = 0.03
 """Between two looks at the memory of a run."""
 
 
+class CommandError(Exception):
+    """A program ended with another exit status than 0; the message has the command and the end of its error output."""
+
+
 @dataclass(frozen=True, slots=True)
 class Cost:
     """One run: ``wall_s`` of the whole command, ``cpu_s`` of all its processes, ``flush_s`` until the disk had its output.
@@ -64,7 +68,7 @@ def _sizes(folder: Path) -> tuple[int, int, int]:
 def run_command(command: list[str], output: Path) -> tuple[Cost, str]:
     """Run ``command``, which writes into the folder ``output``; return what it cost and what it printed on its standard output.
 
-    Raises SystemExit with the end of its error output if it fails.
+    Raises CommandError if it fails.
     """
     printed, complaints = output.parent / "printed", output.parent / "complaints"
     peak, busy_s, started = 0, machine_busy_s(), perf_counter()
@@ -78,7 +82,7 @@ def run_command(command: list[str], output: Path) -> tuple[Cost, str]:
     cpu_s = usage.ru_utime + usage.ru_stime
     other_s = max(0.0, machine_busy_s() - busy_s - cpu_s)
     if process.returncode:
-        raise SystemExit(f"{' '.join(command)}: exit status {process.returncode}: {complaints.read_text(errors='replace')[-500:]}")
+        raise CommandError(f"{' '.join(command)}: exit status {process.returncode}: {complaints.read_text(errors='replace')[-500:]}")
     flushed = perf_counter()
     subprocess.run(["sync", "-f", str(output)], check=True)
     flush_s = perf_counter() - flushed

@@ -5,48 +5,73 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
-Source = Literal["rgb", "height"]
+from tests.bench.inputs import LAYOUTS, PLAIN, Source
+
 CLIPMAP: Final = str(Path(sys.executable).with_name("clipmap"))
 VIPS_LAYOUT: Final = ("--tile-size", "256", "--overlap", "0", "--depth", "onetile")
 COG: Final = "gdal_translate -q -of COG -co BLOCKSIZE=256 -co NUM_THREADS=ALL_CPUS -co BIGTIFF=IF_SAFER {source} {output}/cog.tif"
+COG_JPEG: Final = ("COMPRESS=JPEG", "QUALITY=85")
 OVERVIEWS: Final = (
     "gdaladdo -q -ro -r average --config COMPRESS_OVERVIEW JPEG --config JPEG_QUALITY_OVERVIEW 85 --config GDAL_NUM_THREADS ALL_CPUS "
     "--config PHOTOMETRIC_OVERVIEW YCBCR --config INTERLEAVE_OVERVIEW PIXEL --config GDAL_TIFF_OVR_BLOCKSIZE 256 {output}/link.tif"
 )
+GDAL2TILES: Final = "gdal2tiles.py -q -p raster -r average -w none --processes={processors} {source} {output}/tiles"
+BOX: Final = "box, 2 taps"
+SINC_3: Final = "blackman-sinc 3, 12 taps"
+SINC_6: Final = "blackman-sinc 6, 23 taps"
+LANCZOS: Final = "lanczos 3, 12 taps"
 
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """A command with ``{source}`` and ``{output}``, a folder that exists; ``runs`` is fewer than asked where it is very slow."""
+    """A command with ``{source}``, ``{output}``, a folder that exists, and ``{processors}``.
 
-    case: str
+    ``runs`` is fewer than asked where it is very slow; ``against`` names the program of its case that it is compared with, where
+    that is not the first one.
+    """
+
     name: str
     filter: str
     command: tuple[str, ...]
+    source: Source
     runs: int | None = None
     remark: str = ""
+    against: str | None = None
 
     @property
     def installed(self) -> bool:
         """Whether the program is there."""
         return shutil.which(self.command[0]) is not None
 
-    def line(self, source: Path, output: Path) -> list[str]:
+    def line(self, source: Path, output: Path, processors: int) -> list[str]:
         """Return the command for ``source`` and the folder ``output``."""
-        return [part.format(source=source, output=output) for part in self.command]
+        return [part.format(source=source, output=output, processors=processors) for part in self.command]
 
 
-def _clipmap(layer: str, codec: str, *options: str) -> tuple[str, ...]:
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Programs that are measured in turn; ``runs`` is the most rounds that are worth their time."""
+
+    key: str
+    title: str
+    programs: tuple[Program, ...]
+    runs: int | None = None
+
+
+def clipmap(layer: str, codec: str, *options: str) -> tuple[str, ...]:
+    """Return the command that builds one layer and prints its report as JSON."""
     return (CLIPMAP, "build", "{source}", "-o", "{output}/dataset", "--json", "--layer", layer, "--codec", codec, *options)
 
 
-def _cog(*options: str) -> tuple[str, ...]:
+def cog(*options: str) -> tuple[str, ...]:
+    """Return the command that makes a COG with these creation options."""
     return (*COG.split(), *(part for option in options for part in ("-co", option)))
 
 
-def _vips(suffix: str) -> tuple[str, ...]:
+def vips(suffix: str) -> tuple[str, ...]:
+    """Return the command that cuts a pyramid into files of this suffix, which holds the encoder's options."""
     return ("vips", "dzsave", "{source}", "{output}/vips", "--suffix", suffix, *VIPS_LAYOUT)
 
 
@@ -54,54 +79,112 @@ def _maketx(*options: str) -> tuple[str, ...]:
     return ("maketx", "{source}", "-o", "{output}/maketx.tx", "--tile", "256", "256", *options)
 
 
-def _jpeg(levels: int) -> list[Program]:
-    case = "RGB to JPEG, quality 85"
-    factors = tuple(str(1 << level) for level in range(1, levels))
-    return [
-        Program(case, "clipmap", "blackman-sinc 3, 12 taps", _clipmap("imagery", "jpeg:85")),
-        Program(case, "vips dzsave", "box, 2 taps", _vips(".jpg[Q=85]")),
-        Program(case, "clipmap --filter box", "box, 2 taps", _clipmap("imagery", "jpeg:85", "--filter", "box")),
-        Program(case, "GDAL COG, average", "box, 2 taps", _cog("COMPRESS=JPEG", "QUALITY=85", "RESAMPLING=AVERAGE")),
-        Program(case, "GDAL COG, lanczos", "lanczos 3, 12 taps", _cog("COMPRESS=JPEG", "QUALITY=85", "RESAMPLING=LANCZOS")),
-        Program(
-            case,
-            "gdaladdo",
-            "box, 2 taps",
-            (*OVERVIEWS.split(), *factors),
-            remark="coarse levels only, a quarter of all blocks",
+def _jpeg(side: int) -> Case:
+    source = Source("rgb", side)
+    factors = tuple(str(1 << level) for level in range(1, (side // 256).bit_length()))
+    webp = (*GDAL2TILES.split(), "--tiledriver=WEBP", "--webp-quality=85")
+    return Case(
+        "jpeg",
+        "RGB to JPEG, quality 85",
+        (
+            Program("clipmap", SINC_3, clipmap("imagery", "jpeg:85"), source),
+            Program("vips dzsave", BOX, vips(".jpg[Q=85]"), source),
+            Program("clipmap --filter box", BOX, clipmap("imagery", "jpeg:85", "--filter", "box"), source),
+            Program("GDAL COG, average", BOX, cog(*COG_JPEG, "RESAMPLING=AVERAGE"), source),
+            Program("GDAL COG, lanczos", LANCZOS, cog(*COG_JPEG, "RESAMPLING=LANCZOS"), source),
+            Program("gdaladdo", BOX, (*OVERVIEWS.split(), *factors), source, remark="coarse levels only, a quarter of all blocks"),
+            Program("maketx", BOX, _maketx("--compression", "jpeg:85"), source, 2),
+            Program("gdal2tiles.py, WebP", BOX, webp, source, 1, "quality 85, it knows no JPEG; adds an alpha channel"),
         ),
-        Program(case, "maketx", "box, 2 taps", _maketx("--compression", "jpeg:85"), runs=3),
+    )
+
+
+def _small_jpeg(side: int) -> Case:
+    source = Source("rgb", side)
+    return Case(
+        "jpeg-small",
+        "RGB to JPEG, quality 85",
+        (
+            Program("clipmap", SINC_3, clipmap("imagery", "jpeg:85"), source),
+            Program("vips dzsave", BOX, vips(".jpg[Q=85]"), source),
+            Program("clipmap --filter box", BOX, clipmap("imagery", "jpeg:85", "--filter", "box"), source),
+            Program("GDAL COG, average", BOX, cog(*COG_JPEG, "RESAMPLING=AVERAGE"), source),
+            Program("GDAL COG, lanczos", LANCZOS, cog(*COG_JPEG, "RESAMPLING=LANCZOS"), source),
+        ),
+    )
+
+
+def _png(side: int) -> Case:
+    source = Source("rgb", side)
+    return Case(
+        "png",
+        "RGB to PNG",
+        (
+            Program("clipmap", SINC_3, clipmap("imagery", "png"), source),
+            Program("vips dzsave", BOX, vips(".png"), source),
+            Program("gdal2tiles.py", BOX, tuple(GDAL2TILES.split()), source, 1, "adds an alpha channel"),
+        ),
+    )
+
+
+def _heights(side: int) -> Case:
+    source = Source("height", side)
+    error = ("COMPRESS=LERC", "MAX_Z_ERROR=0.1")
+    zstd, deflate = ("COMPRESS=ZSTD", "PREDICTOR=YES"), ("COMPRESS=DEFLATE", "PREDICTOR=YES")
+    return Case(
+        "heights",
+        "float32 heights, error at most 0.1 m",
+        (
+            Program("clipmap lerc:0.1", SINC_6, clipmap("height", "lerc:0.1"), source),
+            Program("GDAL COG LERC, lanczos", LANCZOS, cog(*error, "RESAMPLING=LANCZOS"), source),
+            Program("GDAL COG LERC, average", BOX, cog(*error, "RESAMPLING=AVERAGE"), source),
+            Program("clipmap lerc:0.1 --filter box", "box, 3 taps", clipmap("height", "lerc:0.1", "--filter", "box"), source),
+            Program("clipmap exr:float", SINC_6, clipmap("height", "exr:float"), source, 2, "lossless"),
+            Program("GDAL COG ZSTD, lanczos", LANCZOS, cog(*zstd, "RESAMPLING=LANCZOS"), source, 2, "lossless"),
+            Program("GDAL COG DEFLATE, lanczos", LANCZOS, cog(*deflate, "RESAMPLING=LANCZOS"), source, 1, "lossless"),
+            Program("clipmap png16", SINC_6, clipmap("height", "png16:0.1,-1000"), source, 1, "steps of 0.1 m"),
+        ),
+    )
+
+
+def _workers(side: int) -> Case:
+    source = Source("rgb", side)
+    programs = [
+        Program(
+            f"clipmap {codec} --workers {count}",
+            SINC_3,
+            clipmap("imagery", codec, "--workers", str(count)),
+            source,
+            against=f"clipmap {codec} --workers 1",
+        )
+        for codec in ("png", "jpeg:85")
+        for count in (1, 2)
     ]
+    return Case("workers", "one worker and two", tuple(programs))
 
 
-def _png() -> list[Program]:
-    case = "RGB to PNG"
-    tiles = ("gdal2tiles.py", "-q", "-p", "raster", "-r", "average", "-w", "none", "--processes=2", "{source}", "{output}/tiles")
-    return [
-        Program(case, "clipmap", "blackman-sinc 3, 12 taps", _clipmap("imagery", "png")),
-        Program(case, "vips dzsave", "box, 2 taps", _vips(".png")),
-        Program(case, "gdal2tiles.py", "box, 2 taps", tiles, runs=2, remark="adds an alpha channel"),
-    ]
+def _growth(small: int, large: int) -> Case:
+    command = clipmap("imagery", "jpeg:85")
+    programs = (Program(f"clipmap, {side} × {side}", SINC_3, command, Source("rgb", side)) for side in (small, large))
+    return Case("growth", "RGB to JPEG, quality 85, small and very large", tuple(programs))
 
 
-def _heights() -> list[Program]:
-    case = "float32 heights, error at most 0.1 m"
-    error, lossless = ("COMPRESS=LERC", "MAX_Z_ERROR=0.1"), ("COMPRESS=ZSTD", "PREDICTOR=YES")
-    return [
-        Program(case, "clipmap lerc:0.1", "blackman-sinc 6, 24 taps", _clipmap("height", "lerc:0.1")),
-        Program(case, "GDAL COG LERC, lanczos", "lanczos 3, 12 taps", _cog(*error, "RESAMPLING=LANCZOS")),
-        Program(case, "GDAL COG LERC, average", "box, 2 taps", _cog(*error, "RESAMPLING=AVERAGE")),
-        Program(case, "clipmap lerc:0.1 --filter box", "box, 2 taps", _clipmap("height", "lerc:0.1", "--filter", "box")),
-        Program(case, "clipmap png16", "blackman-sinc 6, 24 taps", _clipmap("height", "png16:0.1,-1000"), remark="steps of 0.1 m"),
-        Program(case, "clipmap exr:float", "blackman-sinc 6, 24 taps", _clipmap("height", "exr:float"), runs=3, remark="lossless"),
-        Program(case, "GDAL COG ZSTD, lanczos", "lanczos 3, 12 taps", _cog(*lossless, "RESAMPLING=LANCZOS"), remark="lossless"),
-    ]
+def _layouts(side: int) -> Case:
+    programs = []
+    for layout in LAYOUTS:
+        source, own = Source("rgb", side, layout), f"clipmap: {layout}"
+        programs += [
+            Program(own, SINC_3, clipmap("imagery", "jpeg:85"), source, against=own),
+            Program(f"vips dzsave: {layout}", BOX, vips(".jpg[Q=85]"), source, against=own),
+            Program(f"GDAL COG, average: {layout}", BOX, cog(*COG_JPEG, "RESAMPLING=AVERAGE"), source, against=own),
+        ]
+    return Case("layouts", f"RGB to JPEG from other TIFF layouts than {PLAIN}", tuple(programs[3:]), runs=3)
 
 
-def programs(side: int) -> dict[Source, list[Program]]:
-    """Return what is run on each source of ``side`` samples a side, in the order of a round."""
-    levels = (side // 256).bit_length()
-    return {"rgb": _jpeg(levels) + _png(), "height": _heights()}
+def cases(side: int) -> list[Case]:
+    """Return what is measured, in this order, the large sources having ``side`` samples a side."""
+    half = side // 2
+    return [_jpeg(side), _small_jpeg(half), _heights(side), _png(side), _workers(half), _layouts(half), _growth(half, 2 * side)]
 
 
 def versions() -> dict[str, str]:
@@ -114,5 +197,6 @@ def versions() -> dict[str, str]:
             found[name] = "missing"
             continue
         answer = subprocess.run(command, capture_output=True, text=True, check=False)
-        found[name] = (answer.stdout or answer.stderr).strip().partition("\n")[0]
+        said = (answer.stdout or answer.stderr).strip().partition("\n")[0]
+        found[name] = said.removeprefix(f"{name}, ")
     return found

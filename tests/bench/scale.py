@@ -2,7 +2,7 @@
 
     python tests/bench/scale.py [--size 16384] [--codec jpeg:85]
 
-One worker, so that a task has a processor of its own; the source is that of ``stages.py``. Per task: seconds, the part of them spent
+One worker, so that a task has a processor of its own; the source is that of ``inputs.py``. Per task: seconds, the part of them spent
 reading and writing, samples, blocks, requests to the store, bytes. Besides, what the coordinating process spends per task and
 per block. The first build compiles the kernels and is not counted. Results go to ``tests/bench/results/scale-tasks.csv``
 and ``scale.json``.
@@ -24,7 +24,7 @@ from schemas.address import BlockAddress
 from schemas.blockindex import BlockRecord
 from schemas.lattice import Lattice
 from schemas.settings import BuildSettings
-from tests.bench.stages import RESULTS, write_source
+from tests.bench.inputs import Source, write_source
 from tiler.building.build import build_layer
 from tiler.tasks.cut import CutBlock
 from tiler.tasks.ledger import Ledger
@@ -32,6 +32,7 @@ from tiler.tasks.partition import Task, plan_tasks, plan_tiers
 from tiler.tasks.records import TaskRecord
 from tiler.tasks.worker import Done, TaskWorker, Work
 
+RESULTS: Final = Path(__file__).parent / "results"
 SIDES: Final = ((256, 4096), (1024, 8192), (1024, 16384), (4096, 16384))
 """Sides of blocks and of the tasks that go with them in a very large build."""
 ENGINE_S_PER_TASK: Final = 0.0025
@@ -90,9 +91,9 @@ def main() -> None:
     rows: list[dict[str, float]] = []
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
-        write_source(folder / "small.tif", 512)
+        write_source(folder / "small.tif", Source("rgb", 512))
         measure(folder / "small.tif", folder, options.codec, 64, 128)
-        write_source(folder / "source.tif", options.size)
+        write_source(folder / "source.tif", Source("rgb", options.size))
         for block, task in SIDES:
             rows += measure(folder / "source.tif", folder, options.codec, block, task)
     with (RESULTS / "scale-tasks.csv").open("w", newline="") as file:

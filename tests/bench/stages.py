@@ -2,7 +2,7 @@
 
     python tests/bench/stages.py [--size 8192] [--runs 3] [--codec jpeg:85] [--workers N]
 
-The source is made here: RGB of 8 bit with the power spectrum of natural images, as an uncompressed TIFF of 512 x 512 tiles.
+A quick look at one kind of build; ``peers.py`` measures everything. The source is the picture of ``inputs.py``.
 Each build runs in a process of its own: once to compile the kernels (not counted), then ``--runs`` times. Stages are seconds of
 each worker's clock, so with two workers they may add up to twice the wall time. libvips does less: it averages 2 x 2 pixels, where
 clipmap filters with 12 x 12 taps, and does not wait for the disk. Raw results go to ``tests/bench/results``.
@@ -12,63 +12,23 @@ import argparse
 import csv
 import json
 import os
-import platform
 import shutil
 import subprocess
 import sys
 import tempfile
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
 from time import perf_counter, sleep
 from typing import Any, Final
 
-import numpy as np
-import rasterio
-from affine import Affine
-from numpy.typing import NDArray
-
 from schemas.settings import BuildSettings
+from tests.bench.inputs import Source, write_source
+from tests.bench.peers_measure import machine
 from tiler.building.build import build_layer
 
 RESULTS: Final = Path(__file__).parent / "results"
 STAGES: Final = ("read_s", "filter_s", "encode_s", "write_s")
-PERIOD: Final = 4096
-"""The picture repeats after so many samples, without a seam: longer waves would cost memory and add nothing to the work."""
-
-
-def natural_picture(side: int, seed: int = 1) -> NDArray[np.uint8]:
-    """Return (side, side, 3) with amplitudes that fall as 1/f (Field 1987) and channels that share most of their detail."""
-    random = np.random.default_rng(seed)
-    frequency = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None, :]).astype(np.float32)
-    frequency[0, 0] = np.inf
-
-    def field() -> NDArray[np.float32]:
-        noise = np.fft.rfft2(random.standard_normal((side, side), np.float32)) / frequency
-        values: NDArray[np.float32] = np.fft.irfft2(noise, s=(side, side)).astype(np.float32)
-        values /= values.std()
-        return values
-
-    grey = field()
-    picture = np.empty((side, side, 3), np.uint8)
-    for channel, mean in enumerate((105, 110, 95)):
-        picture[..., channel] = np.clip(np.rint(mean + 38 * grey + 9 * field()), 0, 255)
-    return picture
-
-
-def write_source(path: Path, side: int) -> None:
-    """Write the picture as a georeferenced TIFF of ``side`` by ``side`` pixels."""
-    period = min(PERIOD, side)
-    picture = natural_picture(period)
-    profile = {"driver": "GTiff", "width": side, "height": side, "count": 3, "dtype": "uint8", "photometric": "rgb"}
-    tiles = {"tiled": True, "blockxsize": 512, "blockysize": 512, "interleave": "pixel"}
-    with rasterio.open(path, "w", crs="EPSG:32633", transform=Affine(1, 0, 500000, 0, -1, 5000000), **profile, **tiles) as file:
-        for row in range(0, side, period):
-            for column in range(0, side, period):
-                part = picture[: min(period, side - row), : min(period, side - column)]
-                window = rasterio.windows.Window(column, row, part.shape[1], part.shape[0])
-                file.write(np.moveaxis(part, -1, 0), window=window)
 
 
 def peak_rss_bytes(process: int) -> int:
@@ -110,34 +70,19 @@ def timed(command: list[str]) -> tuple[dict[str, float], str]:
 
 def run_clipmap(source: Path, folder: Path, codec: str, workers: int | None) -> dict[str, float]:
     """Build in a new process and return what it cost, start of Python included in ``command_s``."""
-    output = folder / "dataset"
+    output = Path(tempfile.mkdtemp(dir=folder)) / "dataset"
     options = ["--workers", str(workers)] if workers else []
     cost, printed = timed([sys.executable, __file__, "--build", str(source), str(output), "--codec", codec, *options])
-    shutil.rmtree(output)
     report: dict[str, float] = json.loads(printed)
     return cost | report
 
 
 def run_vips(source: Path, folder: Path, quality: str) -> dict[str, float]:
     """Cut the same levels with libvips and return what it cost."""
-    output = folder / "vips"
+    output = Path(tempfile.mkdtemp(dir=folder)) / "vips"
     layout = ["--tile-size", "256", "--overlap", "0", "--depth", "onetile"]
     cost, _ = timed(["vips", "dzsave", str(source), str(output), "--suffix", f".jpg[Q={quality}]", *layout])
-    shutil.rmtree(folder / "vips_files")
     return cost
-
-
-def machine() -> dict[str, Any]:
-    """Return what the figures were measured on."""
-    model = [line.split(":", 1)[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
-    memory_bytes = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return {
-        "processor": model[0] if model else platform.machine(),
-        "processors": len(os.sched_getaffinity(0)),
-        "memory_bytes": memory_bytes,
-        "python": platform.python_version(),
-        "time": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
 
 
 def measure(size: int, runs: int, codec: str, workers: int | None) -> dict[str, Any]:
@@ -147,7 +92,7 @@ def measure(size: int, runs: int, codec: str, workers: int | None) -> dict[str, 
     with tempfile.TemporaryDirectory(prefix="clipmap-bench-") as name:
         folder = Path(name)
         source = folder / "source.tif"
-        write_source(source, size)
+        write_source(source, Source("rgb", size))
         run_clipmap(source, folder, codec, workers)
         for _ in range(runs):
             result["clipmap"].append(run_clipmap(source, folder, codec, workers))
