@@ -7,6 +7,7 @@ from typing import Any, Final
 from pydantic.json_schema import models_json_schema
 
 from schemas.batch import BatchReport
+from schemas.effects import EffectPlan
 from schemas.estimates import BuildEstimate
 from schemas.facts import BlockFacts, DatasetFacts, LayerFacts, LevelFacts, PointFacts
 from schemas.findings import DiffReport, VerifyReport
@@ -24,6 +25,7 @@ REPORTS: Final[tuple[type[Model], ...]] = (
     DiffReport,
     BuildEstimate,
     BatchReport,
+    EffectPlan,
 )
 
 
@@ -32,9 +34,10 @@ def schema() -> dict[str, Any]:
     _, definitions = models_json_schema([(model, "serialization") for model in REPORTS], title="clipmap reports")
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "$comment": f"Generated from facts.py, findings.py, estimates.py and batch.py of schemas/ by docs/generate/{Path(__file__).name}. "
+        "$comment": "Generated from facts.py, findings.py, estimates.py, batch.py and effects.py of schemas/ by "
+        f"docs/generate/{Path(__file__).name}. "
         "inspect prints DatasetFacts, LayerFacts, LevelFacts, BlockFacts or PointFacts, verify VerifyReport, diff DiffReport, "
-        "build --plan BuildEstimate, batch BatchReport.",
+        "build --plan BuildEstimate, batch BatchReport; EffectPlan is a plan of effects of light.",
         "anyOf": [{"$ref": f"#/$defs/{model.__name__}"} for model in REPORTS],
         **definitions,
     }
