@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable
 from functools import update_wrapper
 from importlib import import_module
-from typing import Any, Final, Generic, ParamSpec, Protocol, TypeVar, overload
+from typing import Any, Final, Generic, ParamSpec, TypeVar
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -19,9 +19,8 @@ _CHOOSING: Final = threading.Lock()
 class Kernel(Generic[P, R]):
     """A function in the part of Python that numba compiles; called like any other, and by other kernels."""
 
-    def __init__(self, function: Callable[P, R], options: dict[str, object]) -> None:
+    def __init__(self, function: Callable[P, R]) -> None:
         self.py_func = function
-        self.options = options
         self._dispatcher: Callable[P, R] | None = None
         update_wrapper(self, function)
 
@@ -39,19 +38,9 @@ class Kernel(Generic[P, R]):
         return self._dispatcher
 
 
-class _Decorator(Protocol):
-    def __call__(self, function: Callable[P, R], /) -> Kernel[P, R]: ...
+def compiled(function: Callable[P, R]) -> Kernel[P, R]:
+    """Make a function a kernel: a decorator in place of numba's own, whose cache fails where it cannot write.
 
-
-@overload
-def compiled(function: Callable[P, R], /) -> Kernel[P, R]: ...
-@overload
-def compiled(**options: object) -> _Decorator: ...
-def compiled(function: Callable[..., Any] | None = None, /, **options: object) -> Any:
-    """Make a function a kernel: a decorator, with or without ``options`` of ``numba.njit`` besides ``nogil`` and ``cache``.
-
-    It takes the place of numba's own, whose cache fails where it cannot write; an option it does not know fails at the first call.
+    It takes no options: fast mathematics would lose NaN, and threads of numba's own the order of sums.
     """
-    if function is None:
-        return lambda function: Kernel(function, options)
-    return Kernel(function, options)
+    return Kernel(function)

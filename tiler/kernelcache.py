@@ -36,7 +36,7 @@ _CONSTANTS: Final = (bool, int, float, str, tuple)
 
 def make_dispatcher(kernel: Kernel[..., Any]) -> Any:  # noqa: ANN401 - numba has no types
     """Return what numba calls a dispatcher: compiles ``kernel`` for the types it is called with, or finds that on disk."""
-    dispatcher = numba.njit(nogil=True, **kernel.options)(kernel.py_func)
+    dispatcher = numba.njit(nogil=True)(kernel.py_func)
     dispatcher._cache = KernelCache(kernel)
     return dispatcher
 
@@ -52,7 +52,6 @@ class KernelCache(NullCache):  # type: ignore[misc]  # numba has no types
 
     def __init__(self, kernel: Kernel[..., Any]) -> None:
         self._function = cast("FunctionType", kernel.py_func)
-        self._options = kernel.options
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:  # noqa: ANN401
         """Return the code for arguments of the types ``sig``; None if there is none on disk that is of use."""
@@ -70,8 +69,11 @@ class KernelCache(NullCache):  # type: ignore[misc]  # numba has no types
         """Keep the code ``data`` where the first folder can be written to; nowhere if none can."""
         if data.library.has_dynamic_globals or data.lifted:  # addresses of this process
             return
-        content = dumps(data._reduce())
-        name = self._name(sig, data.codegen)
+        # A numba to come may have other insides: then kernels are compiled every time, as where nothing can be written.
+        with suppress(AttributeError, TypeError, pickle.PicklingError):
+            self._keep(self._name(sig, data.codegen), dumps(data._reduce()))
+
+    def _keep(self, name: str, content: bytes) -> None:
         for folder in self._folders:
             with suppress(OSError):
                 folder.mkdir(parents=True, exist_ok=True)
@@ -91,9 +93,8 @@ class KernelCache(NullCache):  # type: ignore[misc]  # numba has no types
         return f"{function.__module__}.{function.__qualname__}.{sys.implementation.cache_tag}-{says}-"
 
     def _name(self, sig: Any, codegen: Any) -> str:  # noqa: ANN401
-        """Return the file for argument types: the processor's name and features count, as do versions and options."""
-        options = sorted((name, sorted(value) if isinstance(value, set) else value) for name, value in self._options.items())
-        depends = (str(sig), codegen.magic_tuple(), numba.__version__, llvmlite.__version__, options)
+        """Return the file for argument types: the processor's name and features count, as do versions."""
+        depends = (str(sig), codegen.magic_tuple(), numba.__version__, llvmlite.__version__)
         return f"{self._stem}{hashlib.blake2b(repr(depends).encode(), digest_size=12).hexdigest()}.kernel"
 
     def _sweep(self, folder: Path, name: str) -> None:

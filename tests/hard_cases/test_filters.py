@@ -78,13 +78,29 @@ def test_c05_impulse(kind: str, place: tuple[int, int]) -> None:
 
 def test_c16_no_fast_math_anywhere() -> None:
     """numba's fastmath makes isnan() always false; no kernel may have it, nor parallel reductions of undefined order."""
-    found = 0
+    kernels, made = 0, 0
     for path in (ROOT / "tiler").rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
+        text = path.read_text()
+        assert path.name == "kernelcache.py" or "numba" not in {name.partition(".")[0] for name in imported(text)}, path
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef):
+                kernels += any(isinstance(decorator, ast.Name) and decorator.id == "compiled" for decorator in node.decorator_list)
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in ("njit", "jit", "vectorize"):
-                found += 1
-                assert not {keyword.arg for keyword in node.keywords} & {"fastmath", "parallel"}, f"{path}:{node.lineno}"
-    assert found >= 8
+                made += 1
+                assert {keyword.arg for keyword in node.keywords} == {"nogil"}, f"{path}:{node.lineno}"
+    assert made == 1, "every kernel is made by tiler.kernelcache, without options"
+    assert kernels >= 8
+
+
+def imported(text: str) -> set[str]:
+    """The modules that a module's text imports, wherever it does."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        if isinstance(node, ast.ImportFrom):
+            names.add(node.module or "")
+    return names
 
 
 def test_c16_nan_survives_the_kernels() -> None:
