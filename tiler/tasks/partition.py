@@ -9,13 +9,13 @@ from schemas.region import Rect
 from tiler.sources import Layout
 
 _BAND: Final = 32768
-_SIDE: Final = 8192
+_SIDE: Final = 4096
 _LEAST_SIDE: Final = 2048
 _LARGEST_SIDE: Final = 16384
-"""Sides of tasks [level-0 samples]. With blocks of 256, of every sample 1/1024 or (2048) 1/64 is handed on as float32.
+"""Sides of tasks [level-0 samples]. With blocks of 256, of every sample 1/256 or (2048) 1/64 is handed on as float32.
 
-What lies around a task is filtered and, in whole tiles, read once more: of tiles of 512 a task of 8192 reads 1.27 times its samples,
-one of 4096 1.56 times, one of 2048 2.25 times.
+What lies around a task is filtered and, in whole tiles, read once more: of tiles of 512 a task of 4096 reads 1.56 times its samples, one
+of 2048 2.25 times. One of 8192 reads 1.27 times, which makes a build to JPEG 4 % faster, with a quarter more memory.
 """
 _TASKS_PER_WORKER: Final = 2
 """With fewer tasks for every worker the last of them leaves the others idle for too long; more of them read and filter more halo."""
