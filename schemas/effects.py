@@ -75,3 +75,33 @@ class EffectPlan(Model):
             if planned.effect == name:
                 return planned
         raise KeyError(name)
+
+
+class ProvedEffect(Model):
+    """One effect of a bake, baked with and without: what it changes, beside what it can."""
+
+    effect: EffectName
+    verdict: Verdict
+    unit: Unit = Field(description="Unit of bound and actual")
+    bound: float | None = Field(ge=0, description="The most it can change anywhere, by the plan")
+    actual: float = Field(ge=0, description="The most it changes on the samples that were baked, reflections of it aside")
+    holds: bool = Field(description="Whether it changes no more than its bound, up to the rounding of a bake")
+
+
+class EffectProof(Model):
+    """A plan put to the proof: all effects that are baked, with and without, on a window of the map."""
+
+    plan: EffectPlan
+    x0: int = Field(ge=0, description="First column of the window [samples]")
+    y0: int = Field(ge=0, description="First row of the window [samples]")
+    width: int = Field(ge=1, description="Columns of the window [samples]")
+    height: int = Field(ge=1, description="Rows of the window [samples]")
+    effects: list[ProvedEffect]
+    difference_codes: float = Field(
+        ge=0, description="Largest difference of the window's picture with all effects to that by the plan [codes of the scene's transfer]"
+    )
+    allowed_codes: float = Field(gt=0, description="The scene's tolerance [codes]")
+    samples_over: int = Field(ge=0, description="Samples whose difference is more than the tolerance")
+    turned_deg: float = Field(ge=0, description="By how much what is left out turns the sun where shadows are hard, together [degrees]")
+    allowed_deg: float = Field(gt=0, description="The scene's tolerance of that [degrees]")
+    holds: bool = Field(description="Whether every bound holds, and the picture and the sun are within the tolerance")

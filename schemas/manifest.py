@@ -30,7 +30,7 @@ MAX_PATCHED_BLOCKS = 1 << 33
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
 Transform = tuple[float, float, float, float, float, float]
 SampleType = Literal["uint8", "uint16", "float32"]
-LayerKind = Literal["imagery", "height"]
+LayerKind = Literal["imagery", "height", "light"]
 Clamp = Literal["none", "local"]
 KernelName = Literal["blackman-sinc", "kaiser", "lanczos", "triangle", "box"]
 
@@ -85,6 +85,32 @@ class Filter(Model):
     void: Literal["guarded-normalised"] = Field(
         default="guarded-normalised", description="How voids and alpha are weighed: normalised convolution with a guarded fallback"
     )
+
+
+class Light(Model):
+    """What light a layer of kind ``light`` holds, and how it was found.
+
+    A sample is the light on the ground relative to the brightest there can be, sun and open sky on a surface that faces the sun: the sun's
+    light times the share of the sun that is seen and the cosine of its incidence, plus ``sky_share`` times the share of the sky that is
+    seen, plus what the ground reflects, all over ``1 + sky_share``. Whole numbers hold its sRGB encoding, see ``filter.linear_light``.
+    """
+
+    height: str = Field(description="Name of the layer whose heights the light falls on")
+    azimuth_deg: float = Field(description="The sun's azimuth at the layer's centre, clockwise from true north [degrees]")
+    elevation_deg: float = Field(description="The sun's elevation there, as it was simulated [degrees]")
+    grid_azimuth_deg: float = Field(description="The same azimuth, clockwise from the direction of decreasing rows [degrees]")
+    when: str | None = Field(description="Time at which the sun stands there, ISO 8601; null if azimuth and elevation were given")
+    shadows: Literal["none", "hard", "certified", "soft"] = Field(
+        description="Cast shadows: none, those of a point, those of a point without a wrong sample, those of the sun's disc"
+    )
+    lines: int | None = Field(description="Lines per sample of hard shadows; null for others")
+    radius_deg: float | None = Field(description="Angular radius of the sun's disc; null if it is a point [degrees]")
+    sky_azimuths: int = Field(ge=0, description="Azimuths in which horizons were looked for; 0: neither sky nor reflections")
+    sky_share: float = Field(ge=0, description="Light of the open sky, relative to that of the sun on a facing surface")
+    albedo: float = Field(ge=0, lt=1, description="Share of its light that the ground reflects, once; 0: nothing")
+    radius_m: float | None = Field(description="Radius of the Earth; null for a flat one [m]")
+    refraction: float = Field(ge=0, lt=1, description="Curvature of a level ray relative to that of the Earth; 0: no air")
+    voids: int = Field(ge=0, description="Void samples of the heights: they have no light, and shade nothing")
 
 
 class Statistics(Model):
@@ -165,6 +191,11 @@ class Layer(Model):
     fill: int = Field(default=0, ge=0, description="Voids up to this many samples across were filled before the pyramid was built")
     enhance: str | None = Field(
         default=None, description="How samples were enhanced before the pyramid was built, e.g. wavelet:1.5; null if they were not"
+    )
+    light: Light | None = Field(
+        default=None,
+        exclude_if=lambda light: light is None,
+        description="What light this is; left out of layers of other kinds",
     )
     source: Source = Field(description="Where the layer came from")
     statistics: Statistics = Field(description="What level 0 holds")

@@ -1,11 +1,12 @@
 """Settings of a build and of a server: frozen, one line and unit per field, passed in, never global."""
 
+from datetime import datetime
 from pathlib import Path
 from typing import Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_serializer, field_validator, model_validator
 
-from schemas.manifest import Clamp, KernelName, LayerKind
+from schemas.manifest import Clamp, KernelName
 
 HeightEncoding = Literal["terrarium", "terrain-rgb"]
 MAX_SAMPLES: Final = 1 << 40
@@ -21,7 +22,7 @@ class Settings(BaseModel):
 class BuildSettings(Settings):
     """What ``clipmap build`` is told; ``None`` means: chosen from the source."""
 
-    layer: LayerKind | None = Field(default=None, description="Kind of the layer; guessed from the source where safe")
+    layer: Literal["imagery", "height"] | None = Field(default=None, description="Kind of the layer; guessed from the source where safe")
     block: int = Field(default=256, description="Side of a block's core [samples], a power of two")
     pad: int = Field(default=0, ge=0, description="Stored border of a block, copied from its neighbours [samples]")
     codec: str | None = Field(default=None, description="Block codec, e.g. jpeg:85, png, webp:90, lerc:0.01")
@@ -72,6 +73,49 @@ class BuildSettings(Settings):
     def _sensible(self) -> Self:
         if self.height_scale == 0:
             raise ValueError("height_scale must not be 0")
+        return self
+
+
+class LightSettings(Settings):
+    """What ``clipmap light`` is told: one sun, and what is simulated of it, of the sky and of the ground."""
+
+    layer: str = Field(default="light", description="Name of the layer that is made")
+    height: str = Field(default="height", description="Name of the layer of heights that light falls on")
+    azimuth_deg: float | None = Field(default=None, allow_inf_nan=False, description="The sun's azimuth from true north [degrees]")
+    elevation_deg: float | None = Field(default=None, ge=-90, le=90, description="The sun's elevation, without air [degrees]")
+    when: datetime | None = Field(default=None, description="Time at which the sun is looked for, instead of its azimuth and elevation")
+    shadows: Literal["none", "hard", "certified", "soft"] = Field(
+        default="hard", description="No cast shadows, those of a point, those without a wrong sample, or those of the sun's disc"
+    )
+    lines: int = Field(default=1, ge=1, le=64, description="Lines per sample of hard shadows: twice as many leave a quarter of the errors")
+    radius_deg: float = Field(default=0.2666, gt=0, le=5, description="Angular radius of the sun's disc, for soft shadows [degrees]")
+    sky: int = Field(default=0, ge=0, le=360, description="Azimuths in which the sky is looked for; 0: no light from the sky")
+    share: float = Field(default=0.15, gt=0, le=10, description="Light of the open sky, relative to that of the sun on a facing surface")
+    bounce: bool = Field(default=False, description="Light that the ground reflects once")
+    albedo: float = Field(default=0.3, gt=0, lt=1, description="Share of its light that the ground reflects")
+    curvature: bool = Field(default=True, description="The ground is curved")
+    refraction: bool = Field(default=False, description="The air lifts the sun and bends its rays")
+    codec: str = Field(default="png", description="Block codec: png, jpeg:Q, raw, exr:half or exr:float")
+    bits: Literal[8, 16] = Field(default=8, description="Bits of a sample of png and raw")
+    block: int | None = Field(default=None, description="Side of a block [samples]; that of the heights by default")
+    task: int | None = Field(default=None, ge=2, description="Side of a task [level-0 samples]; has no effect on the result")
+    workers: int | None = Field(default=None, ge=1, le=256, description="Threads; has no effect on the result")
+    overwrite: bool = Field(default=False, description="Replace the layer if the dataset has it already")
+    update: bool = Field(default=False, description="Rebuild only what changed heights change")
+    records: bool = Field(default=True, description="Keep what update needs")
+    break_lock: bool = Field(default=False, description="Take over the lock of a build that has given no sign of life for minutes")
+
+    @field_serializer("when")
+    def _as_text(self, when: datetime | None) -> str | None:
+        return None if when is None else when.isoformat()
+
+    @model_validator(mode="after")
+    def _one_sun(self) -> Self:
+        angles = (self.azimuth_deg, self.elevation_deg)
+        if self.when is None and None in angles:
+            raise ValueError("a sun needs azimuth and elevation, or a time")
+        if self.when is not None and angles != (None, None):
+            raise ValueError("a sun has azimuth and elevation, or a time, not both")
         return self
 
 

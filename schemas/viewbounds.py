@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Final
 
 MORPH_SLACK: Final = 1e-3
-"""Part of the morph's width by which a level is all coarse before its rim; also in ``viewer.morph``."""
+"""Part of the morph's width by which a level is all coarse before its rim, so that it is in float32 too."""
 
 KOSCHMIEDER: Final = 3.912
 """-ln 0.02: at the visibility a black object's contrast against the haze is 2 % (Koschmieder 1924; WMO No. 8, I.9)."""

@@ -7,7 +7,7 @@ from typing import Any, Final
 from pydantic.json_schema import models_json_schema
 
 from schemas.batch import BatchReport
-from schemas.effects import EffectPlan
+from schemas.effects import EffectPlan, EffectProof
 from schemas.estimates import BuildEstimate
 from schemas.facts import BlockFacts, DatasetFacts, LayerFacts, LevelFacts, PointFacts
 from schemas.findings import DiffReport, VerifyReport
@@ -26,6 +26,7 @@ REPORTS: Final[tuple[type[Model], ...]] = (
     BuildEstimate,
     BatchReport,
     EffectPlan,
+    EffectProof,
 )
 
 
@@ -37,7 +38,7 @@ def schema() -> dict[str, Any]:
         "$comment": "Generated from facts.py, findings.py, estimates.py, batch.py and effects.py of schemas/ by "
         f"docs/generate/{Path(__file__).name}. "
         "inspect prints DatasetFacts, LayerFacts, LevelFacts, BlockFacts or PointFacts, verify VerifyReport, diff DiffReport, "
-        "build --plan BuildEstimate, batch BatchReport; EffectPlan is a plan of effects of light.",
+        "build --plan BuildEstimate, batch BatchReport; plan EffectPlan, plan --prove EffectProof.",
         "anyOf": [{"$ref": f"#/$defs/{model.__name__}"} for model in REPORTS],
         **definitions,
     }

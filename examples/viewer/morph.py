@@ -10,10 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from schemas.viewbounds import MORPH_SLACK
 
-SLACK = 1e-3
-"""Part of the morph's width given away so that alpha reaches 1 in float32 too."""
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,10 +31,11 @@ def ramp(n: int) -> Ramp:
     """Return the ramp of a grid of n x n vertices.
 
     The viewer may be one sample off the centre, which ``start`` pays for: alpha is 1 on the whole rim and 0 on the inner
-    boundary for every viewer that ``placement.grid_origin`` allows, as n / 10 <= (n - 1) / 4 - 3 / 2 for n >= 15.
+    boundary for every viewer that ``placement.grid_origin`` allows, as n / 10 <= (n - 1) / 4 - 3 / 2 for n >= 15. ``MORPH_SLACK``
+    of the width is given away so that alpha reaches 1 in float32 too.
     """
     width = n / 10
-    return Ramp((n - 1) / 2 - width - 1, 1 / (width * (1 - SLACK)))
+    return Ramp((n - 1) / 2 - width - 1, 1 / (width * (1 - MORPH_SLACK)))
 
 
 def alpha(x: Floats, y: Floats, viewer: tuple[float, float], level_ramp: Ramp) -> Floats:

@@ -138,7 +138,8 @@ def _any(named: _Named | None) -> _Named:
 def _choose(manifest: Manifest, kind: LayerKind, name: str | None) -> _Named | None:
     if name is not None:
         layer = manifest.layer(name)
-        if layer.kind != kind:
+        is_drawn_alike = (kind, layer.kind) == ("imagery", "light")
+        if layer.kind != kind and not is_drawn_alike:
             raise UsageError(f"layer {name!r} is of kind {layer.kind}, not {kind}")
         return name, layer
     names = [known for known, layer in manifest.layers.items() if layer.kind == kind]

@@ -6,7 +6,8 @@
     python tests/bench/peers.py --size 2048 --runs 2 --scratch   # a trial: no results, no report
     python tests/bench/peers.py --report                         # only write docs/PERFORMANCE.md
 
-Cases are jpeg, jpeg-small, heights, png, workers, layouts and growth; besides, errors (of the coarse levels) and limits (of the machine).
+Cases are jpeg, jpeg-small, heights, png, workers, layouts and growth; besides, errors (of the coarse levels), limits (of the machine) and
+light (shadows and horizons: ``peers_light.py``).
 Sources are made here. A round runs every program of a case once, A B C A B C, after one round on small sources that is not counted.
 Every output is kept until the end, see ``peers_room.py``: with the default size that takes some 40 GB. Programs that are not installed are
 named and left out. Results go to ``tests/bench/results/peers.json``, ``peers.csv`` and ``peers-errors.csv``; then the generated parts
@@ -26,6 +27,7 @@ from typing import Any, Final
 
 from tests.bench.peers_cost import CommandError
 from tests.bench.peers_errors import check_box, measure_errors
+from tests.bench.peers_light import compare
 from tests.bench.peers_limits import limits
 from tests.bench.peers_measure import run_case
 from tests.bench.peers_programs import cases, versions
@@ -123,6 +125,8 @@ def main() -> None:
             result = measure(options.size, options.runs, options.only, options.folder, keep)
         except CommandError as failure:
             raise SystemExit(str(failure)) from failure
+        if re.search(options.only, "light: ") and not options.scratch:
+            compare(None, 1.0, 90.0, min(options.runs, 3))
         if options.scratch:
             sys.stdout.write(json.dumps(result, indent=1) + "\n")
             return

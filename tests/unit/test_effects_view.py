@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from schemas import viewbounds
 from tests.reference import effects as reference
-from viewer.morph import SLACK, alpha, ramp
+from viewer.morph import alpha, ramp
 from viewer.placement import GRID_SIDES, grid_origin
 
 hundredths = st.integers(-100, 100).map(lambda n: n / 100)
@@ -71,10 +71,6 @@ def test_levels_begin_no_nearer(n: int, level: int, viewer: float, place: int) -
     distance = abs(vertex - at) * 2**level
     if shown > 0:
         assert shown / distance <= (1 + 1e-9) / viewbounds.first_distance_m(n, 2.0 ** (level + 1))
-
-
-def test_the_slack_is_the_viewers() -> None:
-    assert viewbounds.MORPH_SLACK == SLACK
 
 
 @given(st.lists(st.integers(0, 1000).map(float), min_size=1, max_size=6), st.sampled_from(GRID_SIDES))

@@ -20,8 +20,8 @@ figcaption, .note { color: #52616f; font-size: 0.9rem }
 """
 
 
-def page(content: dict[str, Any]) -> str:
-    """Return the page for the raw results of a report, as ``Report.as_dict`` gives them."""
+def page(content: dict[str, Any], light: str = "") -> str:
+    """Return the page for the raw results of a report, as ``Report.as_dict`` gives them; ``light`` is a section of its own."""
     sample, unit = content["sample"], content["sample"]["unit"]
     size = f"{sample['width']} × {sample['height']}" + (f" × {sample['channels']}" if sample["channels"] > 1 else "")
     sections = [
@@ -36,6 +36,7 @@ def page(content: dict[str, Any]) -> str:
         "<h2>What it looks like</h2>" + _figure("differences.png", "Level 1 minus the ideal level, where the box filter is furthest off."),
         f"<h2>Precision</h2>{_precision(content)}{_PRECISION_NOTE}",
         f"<h2>Voids</h2>{_figure('voids.svg', 'Level 1 of a sample from which more and more was removed.')}{_voids(content)}{_VOID_NOTE}",
+        light,
         f"<h2>How it was measured</h2>{_METHOD[sample['edge']]}{_machine(content)}",
     ]
     body = "\n".join(sections)
@@ -74,7 +75,7 @@ def _figure(name: str, caption: str) -> str:
     return f'<figure><img src="{name}" alt="{escape(caption)}"><figcaption>{escape(caption)}</figcaption></figure>'
 
 
-def _table(header: Sequence[str], rows: Iterable[tuple[str, Sequence[str]]]) -> str:
+def table(header: Sequence[str], rows: Iterable[tuple[str, Sequence[str]]]) -> str:
     """Return a table; each row is (class of the row, cells)."""
     head = "".join(f"<th>{escape(cell)}</th>" for cell in header)
     body = "\n".join(f'<tr class="{kind}">' + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>" for kind, cells in rows)
@@ -105,7 +106,7 @@ def _kernels(content: dict[str, Any]) -> str:
         numbers += [first["rms_float64"], first["rms_float16"]]
         numbers += [candidate["errors"][level]["rms"] for level in levels if level]
         rows.append((_class(candidate["name"], content), [candidate["name"], *(_number(number, 4) for number in numbers)]))
-    return _table(header, rows)
+    return table(header, rows)
 
 
 def _figures(content: dict[str, Any]) -> str:
@@ -122,13 +123,13 @@ def _figures(content: dict[str, Any]) -> str:
             ]
             cells += [f"{own['step_overshoot_percent']:.2f}", f"{own['l1_norm']:.3f}"]
             rows.append((_class(candidate["name"], content), [candidate["name"], *cells]))
-    return _table(header, rows)
+    return table(header, rows)
 
 
 def _precision(content: dict[str, Any]) -> str:
     header = ["offset", "level", "float32 spacing", "shipped rms", "shipped max", "plain rms", "plain max"]
     keys = ("spacing", "shipped_rms", "shipped_largest", "plain_rms", "plain_largest")
-    return _table(
+    return table(
         header, (("", [f"{rung['offset']:g}", str(rung["level"]), *(_number(rung[key]) for key in keys)]) for rung in content["precision"])
     )
 
@@ -140,8 +141,8 @@ def _voids(content: dict[str, Any]) -> str:
         shares = [f"{100 * result[key]:.2f}" for key in ("hole_share", "lost_share")]
         rest = [_number(result[key]) for key in ("overshoot_percent", "rms", "whole_rms")]
         rows.append(("", [result["pattern"], f"{100 * result['share']:g}", result["filter"], *shares, *rest]))
-    return _table(header, rows)
+    return table(header, rows)
 
 
 def _machine(content: dict[str, Any]) -> str:
-    return _table(["", ""], (("", [name, value]) for name, value in [*content["machine"].items(), ("runs", str(content["runs"]))]))
+    return table(["", ""], (("", [name, value]) for name, value in [*content["machine"].items(), ("runs", str(content["runs"]))]))

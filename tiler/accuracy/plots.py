@@ -24,7 +24,7 @@ _SHOWN: Final = 128
 
 
 @contextmanager
-def _drawing(path: Path, size: tuple[float, float], panels: int = 1) -> Iterator[Any]:
+def drawing(path: Path, size: tuple[float, float], panels: int = 1) -> Iterator[Any]:
     """Give the axes of a new figure and write it to ``path`` in the end."""
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -43,7 +43,7 @@ def pareto(sample: Sample, candidates: Sequence[Candidate], path: Path) -> None:
     """Draw error against time: all candidates, and beside them clipmap's kernels closer up; the frontier as a line, the rest grey."""
     default = default_of(sample, candidates)
     own = [one for one in candidates if one.maker == "clipmap"]
-    with _drawing(path, (11, 5.2), 2) as (every, close):
+    with drawing(path, (11, 5.2), 2) as (every, close):
         for axes, shown in ((every, candidates), (close, own)):
             best = frontier(candidates)
             axes.step(*_places([one for one in best if one in shown]), where="post", color=_RIVAL, linewidth=1.1, linestyle="--", zorder=2)
@@ -56,8 +56,8 @@ def pareto(sample: Sample, candidates: Sequence[Candidate], path: Path) -> None:
         every.set_xlim(right=20 * every.get_xlim()[1])
         every.set_title(f"{sample.name}: error against time", loc="left")
         close.set_title("clipmap's kernels, with their radius; circled: the default", loc="left", fontsize=10)
-        _plain_ticks([every.yaxis, close.yaxis], (1.0, 2.0, 5.0))
-        _plain_ticks([every.xaxis], (1.0,))
+        plain_ticks([every.yaxis, close.yaxis], (1.0, 2.0, 5.0))
+        plain_ticks([every.xaxis], (1.0,))
         _legend(close)
 
 
@@ -82,7 +82,8 @@ def _point(axes: Any, one: Candidate, on_frontier: bool, with_radius: bool) -> N
     axes.annotate(label, (x, y), xytext=(6, 3), textcoords="offset points", fontsize=8, color=colour, zorder=order)
 
 
-def _plain_ticks(logarithmic: Sequence[Any], digits: tuple[float, ...]) -> None:
+def plain_ticks(logarithmic: Sequence[Any], digits: tuple[float, ...]) -> None:
+    """Label logarithmic axes at these digits, with numbers as people write them."""
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
     for axis in logarithmic:
@@ -95,7 +96,7 @@ def responses(sample: Sample, candidates: Sequence[Candidate], path: Path) -> No
     """Draw the gain of the default, of the other designs at its radius, and of box."""
     kernels, radius = kernels_of(sample), default_kernel(sample).radius
     frequency = np.linspace(0, 1, 801)
-    with _drawing(path, (9, 3.8), 2) as (linear, decibel):
+    with drawing(path, (9, 3.8), 2) as (linear, decibel):
         for name in ("box", f"blackman-sinc {radius}", f"kaiser {radius}", f"lanczos {radius}"):
             gain = frequency_response(kernels[name], frequency)
             style = {"color": _COLOURS[name.split()[0]], "label": name, "linewidth": 1.6}
@@ -120,7 +121,7 @@ def differences(sample: Sample, path: Path) -> None:
     }
     part = _worst_part(errors["box"])
     scale = float(np.percentile(np.abs(errors["box"][part]), 99.5))
-    with _drawing(path, (10, 3.9), 3) as axes:
+    with drawing(path, (10, 3.9), 3) as axes:
         axes[0].imshow(interior(ideal)[..., 0][part], cmap="gray", interpolation="nearest")
         axes[0].set_title("ideal level 1", loc="left")
         for panel, (name, error) in zip(axes[1:], errors.items(), strict=True):
@@ -143,7 +144,7 @@ def voids(sample: Sample, results: Sequence[VoidResult], path: Path) -> None:
     """Draw what is lost, and the error where samples are whole, against the share of voids; scattered full, holes dashed."""
     names = list(dict.fromkeys(result.filter for result in results))
     colours = dict(zip(names, ("#c2410c", "#1d6fa5", "#2f7d4f", "#6b4fa0"), strict=True))
-    with _drawing(path, (9, 3.8), 2) as (lost, error):
+    with drawing(path, (9, 3.8), 2) as (lost, error):
         for pattern, style in (("scattered", "o-"), ("holes", "s--")):
             for name in names:
                 own = [result for result in results if (result.filter, result.pattern) == (name, pattern)]

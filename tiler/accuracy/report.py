@@ -12,6 +12,9 @@ from schemas.errors import MissingExtraError, StorageError, UsageError
 from tiler.accuracy import plots
 from tiler.accuracy.experiments import Candidate, measure_candidates
 from tiler.accuracy.findings import default_of, dominating, findings, frontier
+from tiler.accuracy.lightground import Ground
+from tiler.accuracy.lightplots import light_pareto
+from tiler.accuracy.lightreport import PLOT, LightReport, light_section, measure_light
 from tiler.accuracy.machine import describe_machine
 from tiler.accuracy.page import page
 from tiler.accuracy.precision import Rung, measure_precision
@@ -33,6 +36,7 @@ class Report:
     candidates: tuple[Candidate, ...]
     precision: tuple[Rung, ...]
     voids: tuple[VoidResult, ...]
+    light: LightReport | None = None
 
     @property
     def findings(self) -> list[str]:
@@ -65,17 +69,19 @@ class Report:
             "candidates": [asdict(candidate) for candidate in self.candidates],
             "precision": [asdict(rung) for rung in self.precision],
             "voids": [asdict(result) for result in self.voids],
-        }
+        } | ({} if self.light is None else {"light": self.light.as_dict()})
 
 
-def measure(sample: Sample, runs: int, on_stage: Callable[[str], None] = lambda stage: None) -> Report:
-    """Run all experiments; ``on_stage`` is told what comes next."""
+def measure(sample: Sample, runs: int, on_stage: Callable[[str], None] = lambda stage: None, ground: Ground | None = None) -> Report:
+    """Run all experiments, those on light if there is a ground for it; ``on_stage`` is told what comes next."""
     on_stage("kernels and rivals: error and time")
     candidates = measure_candidates(sample, runs)
     on_stage("precision of the arithmetic")
     precision = measure_precision(sample)
     on_stage("voids")
-    return Report(sample, runs, describe_machine(), tuple(candidates), tuple(precision), tuple(measure_voids(sample)))
+    voids = measure_voids(sample)
+    light = None if ground is None else measure_light(ground, runs, on_stage)
+    return Report(sample, runs, describe_machine(), tuple(candidates), tuple(precision), tuple(voids), light)
 
 
 def prepare_folder(folder: Path) -> None:
@@ -120,7 +126,12 @@ def write_report(report: Report, folder: Path) -> Path:
         plots.differences(report.sample, folder / "differences.png")
         plots.voids(report.sample, report.voids, folder / "voids.svg")
         index = folder / "index.html"
-        index.write_text(page(content), encoding="utf-8")
+        section = ""
+        if report.light is not None:
+            _write_csv(folder / "light.csv", content["light"]["results"])
+            light_pareto(report.sample.name, report.light.results, folder / PLOT)
+            section = light_section(content["light"])
+        index.write_text(page(content, section), encoding="utf-8")
     except OSError as error:
         raise StorageError(f"{folder}: the report cannot be written: {error.strerror or error}") from error
     return index

@@ -89,16 +89,16 @@ def build_layer(
             stamps = SourceStamps(samples.info)
             intent = decide(store, claim, dataset, plan, stamps, settings)
             if intent.act is None and dataset is not None:
-                return _up_to_date(store, claim, dataset, plan, intent, settings.records, started)
+                return up_to_date(store, claim, dataset, plan, intent, settings.records, started)
             engine = engine or LocalEngine(plan.workers)
             build = LayerBuild(plan, intent, sources, store, claim, dataset, stamps, settings, engine)
             build.run(on_progress)
         finally:
             samples.close()
-    return _report(build, intent, claim, perf_counter() - started)
+    return report_of(build, intent, claim, perf_counter() - started)
 
 
-def _up_to_date(store: Store, claim: Claim, dataset: Manifest, plan: Plan, intent: Intent, records: bool, started: float) -> BuildReport:
+def up_to_date(store: Store, claim: Claim, dataset: Manifest, plan: Plan, intent: Intent, records: bool, started: float) -> BuildReport:
     """Clear what nobody will continue, and records that are not wanted any more; return the report of a build with nothing to do."""
     if not records:
         RecordBook(store, intent.tasks_path).delete()
@@ -121,7 +121,8 @@ def _up_to_date(store: Store, claim: Claim, dataset: Manifest, plan: Plan, inten
     )
 
 
-def _report(build: LayerBuild, intent: Intent, claim: Claim, wall_s: float) -> BuildReport:
+def report_of(build: LayerBuild, intent: Intent, claim: Claim, wall_s: float) -> BuildReport:
+    """Return what a finished build did."""
     plan, manifest = build.plan, build.manifest
     if manifest is None:
         raise UsageError("nothing was built")

@@ -164,6 +164,7 @@ class LayerBuild:
             sources=[str(path.absolute()) for path in self._sources],
             stamps=self._stamps.stamps,
             ranges=list(self.plan.source.conversion.stretch or ()),
+            light=self.plan.light_settings,
             settings=self._settings.model_copy(update={"overwrite": False, "update": False, "break_lock": False}),
         )
 

@@ -13,15 +13,14 @@ from pydantic import JsonValue
 
 from schemas.errors import UsageError
 from schemas.lattice import Lattice, Registration
-from schemas.manifest import LayerKind, Manifest, digest
+from schemas.manifest import LayerKind, Light, Manifest, digest
 from schemas.region import Rect
-from schemas.settings import BuildSettings
+from schemas.settings import BuildSettings, LightSettings
 from tiler.building.placement import Placement, place
 from tiler.codecs import BlockFormat, Codec, open_codec
 from tiler.filters.cascade import Recipe
 from tiler.filters.edges import EdgeRule
 from tiler.filters.kernels import DESIGNS, FIXED_RADIUS
-from tiler.samples.enhance import parse_enhancement
 from tiler.sources.convert import SampleSource
 from tiler.tasks.partition import Task, Tier, choose_task_side, count_tasks, plan_tasks, plan_tiers
 from tiler.tasks.records import Partition
@@ -42,6 +41,8 @@ class _Defaults:
 _DEFAULTS: Final[dict[LayerKind, _Defaults]] = {
     "height": _Defaults("point", "antisymmetric", 6),
     "imagery": _Defaults("area", "mirror", 3),
+    # A shadow beside the edge must not be continued as the opposite of itself.
+    "light": _Defaults("point", "mirror", 3),
 }
 
 
@@ -61,6 +62,8 @@ class Plan:
     linear_light: bool
     fill: int
     enhance: str | None
+    light: Light | None = None
+    light_settings: LightSettings | None = None
 
     @cached_property
     def tiers(self) -> tuple[Tier, ...]:
@@ -93,6 +96,7 @@ class Plan:
             "linear-light": self.linear_light,
             "fill": self.fill,
             "enhance": self.enhance,
+            **({} if self.light is None else {"light": self.light.model_dump(mode="json", exclude={"voids"})}),
             **{name: version(name) for name in self.libraries},
         }
 
@@ -161,8 +165,15 @@ def plan_layer(source: SampleSource, dataset: Manifest | None, settings: BuildSe
         workers=workers,
         linear_light=settings.linear_light,
         fill=settings.fill,
-        enhance=None if settings.enhance is None else parse_enhancement(settings.enhance).spec,
+        enhance=None if settings.enhance is None else _enhancement(settings.enhance),
     )
+
+
+def _enhancement(text: str) -> str:
+    """Return the enhancement asked for with all its parameters."""
+    from tiler.samples.enhance import parse_enhancement  # noqa: PLC0415 - 4 ms of every start, used by few
+
+    return parse_enhancement(text).spec
 
 
 def _codec_spec(source: SampleSource, block: BlockFormat, settings: BuildSettings) -> str:

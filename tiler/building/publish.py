@@ -162,7 +162,7 @@ def _write_manifest(plan: Plan, store: Store, dataset: Manifest | None, entry: L
 def _layer_entry(plan: Plan, path: str, patches: list[Patch], ledger: Ledger) -> Layer:
     kernel = plan.recipe.kernel
     return Layer(
-        kind=plan.block.kind,
+        kind=plan.source.conversion.kind,
         path=path,
         patches=patches,
         registration=plan.lattice.registration,
@@ -173,7 +173,7 @@ def _layer_entry(plan: Plan, path: str, patches: list[Patch], ledger: Ledger) ->
         channels=plan.block.channels,
         alpha=plan.block.alpha,
         dtype=plan.block.dtype,
-        unit="metre" if plan.block.kind == "height" else None,
+        unit="metre" if plan.source.conversion.kind == "height" else None,
         codec=plan.codec.spec,
         suffix=plan.codec.suffix,
         media_type=plan.codec.media_type,
@@ -190,6 +190,7 @@ def _layer_entry(plan: Plan, path: str, patches: list[Patch], ledger: Ledger) ->
         source=_source_entry(plan),
         fill=plan.fill,
         enhance=plan.enhance,
+        light=plan.light,
         statistics=ledger.statistics(),
         levels=[ledger.level(level) for level in range(plan.lattice.levels)],
     )

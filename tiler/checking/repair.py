@@ -12,6 +12,7 @@ from schemas.address import BlockAddress
 from schemas.errors import ClipmapError, InputError, NotFoundError, StorageError
 from schemas.findings import Finding, VerifyReport
 from schemas.manifest import digest
+from schemas.settings import LightSettings
 from tiler.building.plan import Plan, plan_layer
 from tiler.checking.verify import Checks, verify
 from tiler.samples.opening import open_samples
@@ -101,8 +102,13 @@ class _Repair:
         record = self._book.plan()
         if record is None:
             raise InputError("there are no records of how the layer was built; rebuild it (clipmap build --overwrite)")
-        self._source = _reopened(dataset, record, workers)
-        self._plan = replace(plan_layer(self._source, dataset.manifest, record.settings), partition=record.partition)
+        self._source: SampleSource
+        if record.light is None:
+            self._source = _reopened(dataset, record, workers)
+            plan, self._stamps = plan_layer(self._source, dataset.manifest, record.settings), SourceStamps(self._source.info)
+        else:
+            plan, self._source, self._stamps = _lit_again(dataset, record.light, workers)
+        self._plan = replace(plan, partition=record.partition)
         # Of other versions of libraries the same bytes are likely, and whether they are is checked block by block.
         if difference := record.explain(self._plan.signature, ignored=self._plan.libraries):
             self.close()
@@ -115,7 +121,7 @@ class _Repair:
     def _worker(self, destination: DamagedBlocks) -> TaskWorker:
         plan = self._plan
         target = Target(self._dataset.store, destination, plan.lattice, plan.block, plan.codec, plan.linear_light)
-        return TaskWorker(plan, target, self._book, SourceStamps(self._source.info))
+        return TaskWorker(plan, target, self._book, self._stamps)
 
     def restore_indexes(self) -> None:
         """Put the indexes together from the task records again."""
@@ -174,6 +180,19 @@ def _reopened(dataset: Dataset, record: PlanRecord, workers: int) -> SampleSourc
         )
     except NotFoundError as error:
         raise InputError(str(error)) from error
+
+
+def _lit_again(dataset: Dataset, settings: LightSettings, workers: int) -> tuple[Plan, SampleSource, SourceStamps]:
+    """Return the plan of a layer of light and the light itself, simulated anew on the dataset's heights."""
+    from tiler.building.light import open_light  # noqa: PLC0415 - a fifth of a second that other layers need not wait for
+
+    plan, source, stamps = open_light(dataset, settings.model_copy(update={"workers": workers}))
+    try:
+        source.bake()
+    except BaseException:
+        source.close()
+        raise
+    return plan, source, stamps
 
 
 def _tasks_of(plan: Plan, blocks: set[BlockAddress]) -> list[Task]:

@@ -32,10 +32,10 @@ class Form:
 
 
 FORMS: Final = {
-    "pmtiles": Form("tiler.export.pmtiles", "write_pmtiles", (".pmtiles",), ("imagery", "height")),
-    "cog": Form("tiler.export.cog", "write_cog", (".tif", ".tiff"), ("imagery", "height")),
-    "dzi": Form("tiler.export.dzi", "write_dzi", (".dzi",), ("imagery",), "heights are no pictures; export them as cog or exr"),
-    "exr": Form("tiler.export.exr", "write_exr", (".exr",), ("imagery", "height")),
+    "pmtiles": Form("tiler.export.pmtiles", "write_pmtiles", (".pmtiles",), ("imagery", "height", "light")),
+    "cog": Form("tiler.export.cog", "write_cog", (".tif", ".tiff"), ("imagery", "height", "light")),
+    "dzi": Form("tiler.export.dzi", "write_dzi", (".dzi",), ("imagery", "light"), "heights are no pictures; export them as cog or exr"),
+    "exr": Form("tiler.export.exr", "write_exr", (".exr",), ("imagery", "height", "light")),
 }
 
 

@@ -86,7 +86,7 @@ def _tile(pyramid: Pyramid, form: _TileForm, level: int, rect: Rect) -> tuple[by
             return data, True
     window = pyramid.window(level, rect)
     samples = window.samples
-    if pyramid.layer.kind == "height":
+    if pyramid.layer.dtype == "float32":
         samples = np.where(window.valid[..., np.newaxis], samples, np.float32(np.nan))
     missing = ((0, form.side - samples.shape[0]), (0, form.side - samples.shape[1]), (0, 0))
     return form.encode(np.pad(samples, missing, mode="edge")), False

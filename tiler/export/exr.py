@@ -88,12 +88,11 @@ class _Conversion:
 
 def _conversion(layer: Layer, *, codes: bool) -> _Conversion:
     names = _NAMES[layer.channels - layer.alpha]
-    if layer.kind == "height":
-        voids = layer.statistics.valid < layer.width * layer.height
-        return _Conversion((*names, "A") if voids else names, "metres", lambda samples: samples, "mask" if voids else "")
-    names, alpha = ((*names, "A"), "stored") if layer.alpha else (names, "")
     if layer.dtype == "float32":
-        return _Conversion(names, "as stored", lambda samples: samples, alpha)
+        voids = layer.statistics.valid < layer.width * layer.height
+        units = "metres" if layer.kind == "height" else "as stored"
+        return _Conversion((*names, "A") if voids else names, units, lambda samples: samples, "mask" if voids else "")
+    names, alpha = ((*names, "A"), "stored") if layer.alpha else (names, "")
     top = int(np.iinfo(layer.dtype).max)
     if not codes and (layer.dtype == "uint8" or layer.filter.linear_light):
         light = light_of_codes(top)

@@ -43,7 +43,7 @@ def geotiff_tags(manifest: Manifest, layer: Layer, compression: dict[str, Any]) 
         "SPARSE_OK": True,
         "BIGTIFF": "NO",
         "ENDIANNESS": "LITTLE",
-        "nodata": float("nan") if layer.kind == "height" else None,
+        "nodata": float("nan") if layer.dtype == "float32" else None,
         **({"crs": manifest.world.crs, "transform": transform} if placed else {}),
         **compression,
     }
