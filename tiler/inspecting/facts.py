@@ -49,6 +49,7 @@ def describe_layer(dataset: Dataset, name: str) -> LayerFacts:
         filter=layer.filter,
         fill=layer.fill,
         enhance=layer.enhance,
+        light=layer.light,
         transform=layer.transform,
         extent=layer.extent,
         ground_spacing_m=layer.ground_spacing_m,
