@@ -41,7 +41,7 @@ def show_proof(proof: EffectProof) -> None:
             "unknown" if one.bound is None else f"{one.bound:.3g} {_UNITS[one.unit]}",
             "holds" if one.holds else "BROKEN",
         )
-        for one in proof.effects
+        for one in (*proof.effects, *proof.view)
     ]
     emit_table(("effect", "verdict", "changes", "at most", "bound"), rows, left=(0, 1, 4))
     click.echo()
@@ -58,7 +58,7 @@ def show_proof(proof: EffectProof) -> None:
 
 
 def _conclusion(proof: EffectProof) -> str:
-    broken = [one for one in proof.effects if not one.holds]
+    broken = [one for one in (*proof.effects, *proof.view) if not one.holds]
     if proof.holds:
         return "Every bound holds, and the picture is within the tolerance."
     if broken:

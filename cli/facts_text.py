@@ -6,8 +6,10 @@ from typing import Any, Final
 
 import click
 
+from cli.light_text import light_pairs
 from cli.output import emit_pairs, emit_table, format_bytes
 from schemas.facts import BlockFacts, CoverageMap, DatasetFacts, Footprint, LayerFacts, LayerPoint, LevelFacts, PointFacts
+from schemas.light import Normals
 from schemas.manifest import Filter, Source
 
 _BLANK, _FULL = "··", "██"
@@ -43,9 +45,11 @@ def show_layer(facts: LayerFacts) -> None:
         ("filter", _filter(facts.filter)),
     ]
     pairs[7:7] = _ground(facts.footprint)
+    pairs += [("normals", _normals(facts.normals))] if facts.normals else []
     pairs += [("filled", f"voids up to {facts.fill} samples across")] if facts.fill else []
     pairs += [("enhanced", facts.enhance)] if facts.enhance else []
     pairs += [("updates", f"{facts.patches}, with blocks under paths of their own")] if facts.patches else []
+    pairs += [] if facts.light is None else light_pairs(facts.light)
     pairs += [("source", source_text(facts.source))]
     emit_pairs(pairs)
     rows = [
@@ -139,6 +143,11 @@ def _mark(share: float) -> str:
     if share in (0, 1):
         return _FULL if share else _BLANK
     return _PARTLY[min(int(share * len(_PARTLY)), len(_PARTLY) - 1)]
+
+
+def _normals(normals: Normals) -> str:
+    between = ", and between them" if normals.density == 2 else ""
+    return f"of {normals.height}{between}: (sample - {normals.zero}) / {normals.one} is x, to the right, and y, upward on the grid"
 
 
 def _filter(kernel: Filter) -> str:

@@ -17,6 +17,7 @@ COMMANDS: Final = {
     "build": "Build a layer of a dataset from a source image or elevation model.",
     "batch": "Build many datasets, side by side, with one report.",
     "light": "Build a layer of light from a dataset's heights and a sun.",
+    "normals": "Build a layer of normals from a dataset's heights.",
     "plan": "Say which effects of light a scene calls for on a dataset.",
     "inspect": "Show a dataset, a level, a block or the values at a place.",
     "verify": "Check a dataset: files, digests, samples, seams.",

@@ -18,11 +18,16 @@ def show_plan(sources: Sequence[Path], output: str, settings: BuildSettings, as_
     if as_json:
         emit_json(estimate.model_dump(mode="json"))
         return
+    show_estimate(estimate)
+
+
+def show_estimate(estimate: BuildEstimate, more: Sequence[tuple[str, str]] = ()) -> None:
+    """Print an estimate for people, and ``more`` pairs of name and text below it."""
     for warning in estimate.warnings:
         click.echo(f"note: {warning}", err=True)
     _show_levels(estimate)
     click.echo()
-    emit_pairs(_pairs(estimate))
+    emit_pairs([*_pairs(estimate), *more])
 
 
 def _show_levels(estimate: BuildEstimate) -> None:

@@ -15,6 +15,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from docs import accuracy_planner
 from docs.markers import with_content
 from schemas.settings import BuildSettings
 from tiler.accuracy.lightexperiments import LightResult
@@ -34,7 +35,13 @@ PEERS: Final = RESULTS / "peers-light.json"
 CROP: Final = 1024
 RUNS: Final = 5
 PUGET_CELL_M: Final = (160.0, 160.0)
-TITLES: Final = {"shadow": "Hard shadows", "horizon": "Horizons", "disc": "The sun's disc", "sky": "The light of the sky"}
+TITLES: Final = {
+    "shadow": "Hard shadows",
+    "horizon": "Horizons",
+    "disc": "The sun's disc",
+    "sky": "The light of the sky",
+    "bounce": "Light that the ground throws back",
+}
 
 Row = dict[str, Any]
 
@@ -142,6 +149,7 @@ def main() -> None:
     parser.add_argument("--report", action="store_true", help="measure nothing, write the text from the raw results")
     if not parser.parse_args().report:
         measure()
+        accuracy_planner.measure()
     content = json.loads(RAW.read_text(encoding="utf-8"))
     where = ", ".join(f"{name} {value}" for name, value in content["machine"].items())
     parts = [ground_text(stem, part) for stem, part in content["grounds"].items()]
@@ -149,6 +157,7 @@ def main() -> None:
     for name, written in (("light", text), ("light, other programs", peers_text())):
         begin, end = f"<!-- {name}: measured, written by docs/accuracy_light.py -->", f"<!-- end of {name} -->"
         TARGET.write_text(with_content(TARGET, begin, end, written), encoding="utf-8")
+    accuracy_planner.write()
 
 
 if __name__ == "__main__":

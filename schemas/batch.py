@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from schemas.manifest import Model
+from schemas.model import Model
 
 JobOutcome = Literal["built", "continued", "updated", "up to date", "failed", "interrupted", "not begun"]
 

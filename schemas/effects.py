@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from schemas.manifest import Model
+from schemas.model import Model
 
 EffectName = Literal[
     "shadow",
@@ -97,6 +97,7 @@ class EffectProof(Model):
     width: int = Field(ge=1, description="Columns of the window [samples]")
     height: int = Field(ge=1, description="Rows of the window [samples]")
     effects: list[ProvedEffect]
+    view: list[ProvedEffect] = Field(default=[], description="Effects of the viewer, as far as they can be told on the window")
     difference_codes: float = Field(
         ge=0, description="Largest difference of the window's picture with all effects to that by the plan [codes of the scene's transfer]"
     )
@@ -105,3 +106,7 @@ class EffectProof(Model):
     turned_deg: float = Field(ge=0, description="By how much what is left out turns the sun where shadows are hard, together [degrees]")
     allowed_deg: float = Field(gt=0, description="The scene's tolerance of that [degrees]")
     holds: bool = Field(description="Whether every bound holds, and the picture and the sun are within the tolerance")
+
+    def with_view(self, view: list[ProvedEffect]) -> "EffectProof":
+        """Return the proof with that of the viewer's effects."""
+        return self.model_copy(update={"view": view, "holds": self.holds and all(one.holds for one in view)})

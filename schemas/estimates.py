@@ -4,7 +4,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from schemas.manifest import LayerKind, Model
+from schemas.manifest import LayerKind
+from schemas.model import Model
 
 PlannedAct = Literal["begin", "continue", "update", "nothing", "refuse"]
 

@@ -5,7 +5,9 @@
 
 from pydantic import Field
 
-from schemas.manifest import Digest, Filter, LayerKind, Light, Model, SampleType, Source, Statistics, Transform
+from schemas.light import Light, Normals
+from schemas.manifest import Digest, Filter, LayerKind, SampleType, Source, Statistics, Transform
+from schemas.model import Model
 
 Extent = tuple[float, float, float, float]
 
@@ -59,6 +61,7 @@ class LayerFacts(Model):
     fill: int = Field(description="Voids up to this many samples across were filled")
     enhance: str | None = Field(description="How samples were enhanced before the pyramid was built")
     light: Light | None = Field(description="What light a layer of light holds; null for others")
+    normals: Normals | None = Field(description="What normals a layer of normals holds; null for others")
     transform: Transform = Field(description="From level-0 sample coordinates to world coordinates")
     extent: Extent = Field(description="x min, y min, x max, y max [world units]")
     ground_spacing_m: tuple[float, float] | None = Field(description="Ground distance between samples of level 0 at the centre [m]")

@@ -4,7 +4,8 @@ from typing import Literal
 
 from pydantic import Field, JsonValue
 
-from schemas.manifest import Digest, Model
+from schemas.manifest import Digest
+from schemas.model import Model
 
 FindingKind = Literal[
     "codec", "index", "availability", "counts", "missing", "unreadable", "length", "digest", "undecodable", "statistics", "seam", "stray"

@@ -11,11 +11,13 @@ import zlib
 from functools import cached_property
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from schemas.address import LAYER_NAME, BlockAddress, block_name
 from schemas.errors import InputError, NotFoundError, UsageError
 from schemas.lattice import Lattice, Registration
+from schemas.light import Light, Normals
+from schemas.model import Model
 
 FORMAT_VERSION = 1
 MANIFEST_NAME = "manifest.json"
@@ -30,15 +32,9 @@ MAX_PATCHED_BLOCKS = 1 << 33
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
 Transform = tuple[float, float, float, float, float, float]
 SampleType = Literal["uint8", "uint16", "float32"]
-LayerKind = Literal["imagery", "height", "light"]
+LayerKind = Literal["imagery", "height", "light", "normal"]
 Clamp = Literal["none", "local"]
 KernelName = Literal["blackman-sinc", "kaiser", "lanczos", "triangle", "box"]
-
-
-class Model(BaseModel):
-    """Base of the manifest's parts: immutable, no unknown fields, finite numbers only."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, json_schema_serialization_defaults_required=True)
 
 
 class World(Model):
@@ -79,38 +75,15 @@ class Filter(Model):
 
     kernel: KernelName = Field(description="Kernel, one dimension of a separable filter")
     radius: int = Field(ge=1, description="Kernel radius [coarse samples]")
-    edge: Literal["antisymmetric", "mirror"] = Field(description="What a filter sees beyond the source's edge")
+    edge: Literal["antisymmetric", "mirror", "mirror-sample"] = Field(
+        description="What a filter sees beyond the source's edge: a point reflection about the outermost sample, a reflection about the "
+        "outer side of the outermost cell, or one about the outermost sample"
+    )
     clamp: Clamp = Field(default="none", description="'local': coarse samples were kept in the range of the valid samples under their taps")
     linear_light: bool = Field(default=False, description="Whether sRGB samples were decoded to light before and encoded after filtering")
     void: Literal["guarded-normalised"] = Field(
         default="guarded-normalised", description="How voids and alpha are weighed: normalised convolution with a guarded fallback"
     )
-
-
-class Light(Model):
-    """What light a layer of kind ``light`` holds, and how it was found.
-
-    A sample is the light on the ground relative to the brightest there can be, sun and open sky on a surface that faces the sun: the sun's
-    light times the share of the sun that is seen and the cosine of its incidence, plus ``sky_share`` times the share of the sky that is
-    seen, plus what the ground reflects, all over ``1 + sky_share``. Whole numbers hold its sRGB encoding, see ``filter.linear_light``.
-    """
-
-    height: str = Field(description="Name of the layer whose heights the light falls on")
-    azimuth_deg: float = Field(description="The sun's azimuth at the layer's centre, clockwise from true north [degrees]")
-    elevation_deg: float = Field(description="The sun's elevation there, as it was simulated [degrees]")
-    grid_azimuth_deg: float = Field(description="The same azimuth, clockwise from the direction of decreasing rows [degrees]")
-    when: str | None = Field(description="Time at which the sun stands there, ISO 8601; null if azimuth and elevation were given")
-    shadows: Literal["none", "hard", "certified", "soft"] = Field(
-        description="Cast shadows: none, those of a point, those of a point without a wrong sample, those of the sun's disc"
-    )
-    lines: int | None = Field(description="Lines per sample of hard shadows; null for others")
-    radius_deg: float | None = Field(description="Angular radius of the sun's disc; null if it is a point [degrees]")
-    sky_azimuths: int = Field(ge=0, description="Azimuths in which horizons were looked for; 0: neither sky nor reflections")
-    sky_share: float = Field(ge=0, description="Light of the open sky, relative to that of the sun on a facing surface")
-    albedo: float = Field(ge=0, lt=1, description="Share of its light that the ground reflects, once; 0: nothing")
-    radius_m: float | None = Field(description="Radius of the Earth; null for a flat one [m]")
-    refraction: float = Field(ge=0, lt=1, description="Curvature of a level ray relative to that of the Earth; 0: no air")
-    voids: int = Field(ge=0, description="Void samples of the heights: they have no light, and shade nothing")
 
 
 class Statistics(Model):
@@ -197,6 +170,11 @@ class Layer(Model):
         exclude_if=lambda light: light is None,
         description="What light this is; left out of layers of other kinds",
     )
+    normals: Normals | None = Field(
+        default=None,
+        exclude_if=lambda normals: normals is None,
+        description="What normals these are; left out of layers of other kinds",
+    )
     source: Source = Field(description="Where the layer came from")
     statistics: Statistics = Field(description="What level 0 holds")
     levels: list[Level] = Field(min_length=1, description="All levels, the finest first")
@@ -267,6 +245,10 @@ class Layer(Model):
             raise ValueError("levels must be listed from 0, without gaps")
         if any(len(patch.levels) != lattice.levels for patch in self.patches):
             raise ValueError("a patch must have a bitmap per level")
+        if (self.kind == "normal") != (self.normals is not None):
+            raise ValueError("layers of kind 'normal', and only these, must have 'normals'")
+        if self.normals is not None and self.channels != 2 + self.alpha:
+            raise ValueError("layers of kind 'normal' must have two channels, and alpha if there is one")
         if len(self.patches) > MAX_PATCHES or len(self.patches) * columns * rows > MAX_PATCHED_BLOCKS:
             raise ValueError(f"{len(self.patches)} patches of a layer of {columns} x {rows} blocks are more than are supported")
         return self

@@ -18,7 +18,7 @@ Choice = Literal["auto", "on", "off"]
 Transfer = Literal["linear", "srgb"]
 
 SUN_RADIUS_DEG: Final = 0.2666
-"""Angular radius of the sun seen from the Earth, mean over the year (0.2621 to 0.2711)."""
+"""Angular radius of the sun at its mean distance, 696 000 km over 149.6 million km [degrees]; 0.2711 in January, 0.2621 in July."""
 EARTH_RADIUS_M: Final = 6_371_008.8
 """Mean radius of the WGS 84 ellipsoid, (2 a + b) / 3."""
 
@@ -124,7 +124,9 @@ class Tolerance(Settings):
         default=0.02, gt=0, le=90, allow_inf_nan=False, description="Error of the sun's direction where its shadows are hard [degrees]"
     )
     transfer: Transfer = Field(default="linear", description="Whether codes are of light itself or of its sRGB encoding")
-    estimates: bool = Field(default=True, description="Whether an effect may be left out by an estimate where a proof fails")
+    estimates: bool = Field(
+        default=False, description="Whether hidden sky and reflected light may be left out by an estimate where a proof fails"
+    )
 
 
 class Effects(Settings):

@@ -6,6 +6,7 @@ from typing import Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_serializer, field_validator, model_validator
 
+from schemas.light import Density, LeftOut
 from schemas.manifest import Clamp, KernelName
 
 HeightEncoding = Literal["terrarium", "terrain-rgb"]
@@ -84,6 +85,7 @@ class LightSettings(Settings):
     azimuth_deg: float | None = Field(default=None, allow_inf_nan=False, description="The sun's azimuth from true north [degrees]")
     elevation_deg: float | None = Field(default=None, ge=-90, le=90, description="The sun's elevation, without air [degrees]")
     when: datetime | None = Field(default=None, description="Time at which the sun is looked for, instead of its azimuth and elevation")
+    density: Density = Field(default=1, description="Samples of light per sample of the heights along a row or a column")
     shadows: Literal["none", "hard", "certified", "soft"] = Field(
         default="hard", description="No cast shadows, those of a point, those without a wrong sample, or those of the sun's disc"
     )
@@ -91,11 +93,12 @@ class LightSettings(Settings):
     radius_deg: float = Field(default=0.2666, gt=0, le=5, description="Angular radius of the sun's disc, for soft shadows [degrees]")
     sky: int = Field(default=0, ge=0, le=360, description="Azimuths in which the sky is looked for; 0: no light from the sky")
     share: float = Field(default=0.15, gt=0, le=10, description="Light of the open sky, relative to that of the sun on a facing surface")
+    open_sky: bool = Field(default=False, description="Light of a sky of which only a sample's own slope hides any, if sky is 0")
     bounce: bool = Field(default=False, description="Light that the ground reflects once")
     albedo: float = Field(default=0.3, gt=0, lt=1, description="Share of its light that the ground reflects")
     curvature: bool = Field(default=True, description="The ground is curved")
     refraction: bool = Field(default=False, description="The air lifts the sun and bends its rays")
-    codec: str = Field(default="png", description="Block codec: png, jpeg:Q, raw, exr:half or exr:float")
+    codec: str = Field(default="png", description="Block codec: png, jpeg:Q, webp:Q, raw, exr:half or exr:float")
     bits: Literal[8, 16] = Field(default=8, description="Bits of a sample of png and raw")
     block: int | None = Field(default=None, description="Side of a block [samples]; that of the heights by default")
     task: int | None = Field(default=None, ge=2, description="Side of a task [level-0 samples]; has no effect on the result")
@@ -103,6 +106,7 @@ class LightSettings(Settings):
     overwrite: bool = Field(default=False, description="Replace the layer if the dataset has it already")
     update: bool = Field(default=False, description="Rebuild only what changed heights change")
     records: bool = Field(default=True, description="Keep what update needs")
+    left_out: tuple[LeftOut, ...] = Field(default=(), description="What a plan of effects has switched off; no effect on the light")
     break_lock: bool = Field(default=False, description="Take over the lock of a build that has given no sign of life for minutes")
 
     @field_serializer("when")
@@ -117,6 +121,23 @@ class LightSettings(Settings):
         if self.when is not None and angles != (None, None):
             raise ValueError("a sun has azimuth and elevation, or a time, not both")
         return self
+
+
+class NormalSettings(Settings):
+    """What ``clipmap normals`` is told."""
+
+    layer: str = Field(default="normal", description="Name of the layer that is made")
+    height: str = Field(default="height", description="Name of the layer of heights whose normals are stored")
+    density: Density = Field(default=1, description="Normals per sample of the heights along a row or a column")
+    codec: str = Field(default="png", description="Block codec: png, raw, exr:half or exr:float")
+    bits: Literal[8, 16] = Field(default=8, description="Bits of a sample of png and raw")
+    block: int | None = Field(default=None, description="Side of a block [samples]; that of the heights by default")
+    task: int | None = Field(default=None, ge=2, description="Side of a task [level-0 samples]; has no effect on the result")
+    workers: int | None = Field(default=None, ge=1, le=256, description="Threads; has no effect on the result")
+    overwrite: bool = Field(default=False, description="Replace the layer if the dataset has it already")
+    update: bool = Field(default=False, description="Rebuild only what changed heights change")
+    records: bool = Field(default=True, description="Keep what update needs")
+    break_lock: bool = Field(default=False, description="Take over the lock of a build that has given no sign of life for minutes")
 
 
 class ServerSettings(Settings):

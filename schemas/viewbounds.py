@@ -13,9 +13,27 @@ MORPH_SLACK: Final = 1e-3
 KOSCHMIEDER: Final = 3.912
 """-ln 0.02: at the visibility a black object's contrast against the haze is 2 % (Koschmieder 1924; WMO No. 8, I.9)."""
 
+SRGB_TOE: Final = 12.92
+"""Slope of the sRGB encoding at black (IEC 61966-2-1), its largest."""
+
 FOUR_POINT_NORM: Final = 1.2512
 """What up to 16 steps of the 4-point scheme (-1, 9, 9, -1) / 16 enlarge absolute values by at most, along one axis: the largest sum of
 absolute weights, 1.25 after one step and 1.25112 after sixteen."""
+
+
+def srgb_codes(linear_codes: float) -> float:
+    """Return what a difference of light [codes] becomes at most in sRGB codes: that of the same light next to black.
+
+    The encoding g is concave and g(0) = 0, so g(a) - g(b) <= g(a - b).
+    """
+    light = linear_codes / 255.0
+    return 255.0 * (SRGB_TOE * light if light <= 0.0031308 else 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+def linear_codes(srgb: float) -> float:
+    """Return the difference of light [codes] that can be at most ``srgb`` codes after encoding; inverse of ``srgb_codes``."""
+    code = srgb / 255.0
+    return 255.0 * (code / SRGB_TOE if code <= 0.04045 else ((code + 0.055) / 1.055) ** 2.4)
 
 
 def focal_px(width_px: float, fov_deg: float) -> float:
@@ -28,7 +46,12 @@ def corner_stretch(width_px: float, height_px: float, fov_deg: float) -> float:
 
     A plane picture shows a small angle there so much longer than in its middle: 1.44 times at 60 degrees and 16:9.
     """
-    return 1 + (math.hypot(width_px, height_px) / 2 / focal_px(width_px, fov_deg)) ** 2
+    return picture_stretch(width_px, height_px, focal_px(width_px, fov_deg))
+
+
+def picture_stretch(width_px: float, height_px: float, focal: float) -> float:
+    """Return what ``corner_stretch`` does, given the distance of the image plane [pixels]."""
+    return 1 + (math.hypot(width_px, height_px) / 2 / focal) ** 2
 
 
 def shift_px(error_m: float, distance_m: float, focal: float, stretch: float = 1.0) -> float:

@@ -12,7 +12,8 @@ from tiler.filters.kernels import DESIGNS
 LevelRows = tuple[Rect, Values, Coverage | None]
 HEIGHT: tuple[Registration, EdgeRule] = ("point", "antisymmetric")
 IMAGERY: tuple[Registration, EdgeRule] = ("area", "mirror")
-KINDS = {"height": HEIGHT, "imagery": IMAGERY}
+LIGHT: tuple[Registration, EdgeRule] = ("point", "mirror-sample")
+KINDS = {"height": HEIGHT, "imagery": IMAGERY, "light": LIGHT}
 
 
 def run_cascade(

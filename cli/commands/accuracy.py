@@ -30,8 +30,9 @@ def command(source: Path | None, output: Path, crop: int, runs: int, light: bool
     """Measure error and time of every filter on the middle of SOURCE, and write a report to OUTPUT.
 
     Levels are compared with ideal ones; OpenImageIO's and GDAL's filters are measured beside. Without SOURCE a built-in terrain is
-    used whose spectrum is known. With --light, sweeps of light are compared with rays that were all walked. The report is
-    OUTPUT/index.html, with raw results beside it. Needs the extra clipmap[report].
+    used whose spectrum is known. With --light, sweeps of light are compared with rays that were all walked, and scenes are lit with all
+    effects and with those that they call for. The report is OUTPUT/index.html, with raw results beside it. Needs the extra
+    clipmap[report].
 
     \b
     clipmap accuracy -o out/accuracy
@@ -57,10 +58,10 @@ def command(source: Path | None, output: Path, crop: int, runs: int, light: bool
         emit_json(
             {"report": str(index)}
             | {key: content[key] for key in ("sample", "findings", "default", "frontier", "default_dominated_by")}
-            | ({"light_findings": content["light"]["findings"]} if light else {})
+            | ({"light_findings": report.light_findings} if light else {})
         )
         return
     height, width, channels = sample.values.shape
     emit_pairs([("sample", f"{sample.name}, {width} x {height} x {channels}, as {sample.kind}"), ("report", str(index))])
-    for sentence in (*sample.remarks, *report.findings, *(report.light.findings if report.light else ())):
+    for sentence in (*sample.remarks, *report.findings, *report.light_findings):
         click.echo(f"- {sentence}")

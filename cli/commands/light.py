@@ -1,19 +1,27 @@
 """``clipmap light``: the heights of a dataset under a sun become a layer of light."""
 
+from dataclasses import replace
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
 import click
 from pydantic import ValidationError
 
+from cli.engines import open_engine
+from cli.light_effects import Wanted, choice_json, choice_pairs, refuse_contradictions, show_light_plan, sun_of, wanted_of
+from cli.light_text import effects_text, sun_text
 from cli.output import emit_json, emit_pairs, format_bytes
 from cli.progress import progress_bar
+from cli.scene_file import read_scene
 from schemas.errors import UsageError
 from schemas.settings import LightSettings
 
 if TYPE_CHECKING:
-    from schemas.manifest import Light
     from tiler.building.light import LightReport
+    from tiler.building.lightplan import EffectChoice
+    from tiler.tasks.engine import Engine
+
+    Lit = tuple[LightReport, EffectChoice | None]
 
 Sun = dict[str, Any]
 
@@ -50,7 +58,8 @@ def parse_times(context: click.Context, parameter: click.Parameter, values: tupl
 @click.option("--when", "times", metavar="ISO8601", multiple=True, callback=parse_times, help="A time; the sun stands where it does then.")
 @click.option("--layer", default="light", show_default=True, help="Name of the layer; of several suns NAME_1, NAME_2 and so on.")
 @click.option("--from", "height", default="height", show_default=True, help="Layer of heights that the light falls on.")
-@click.option("--codec", default="png", show_default=True, help="png, jpeg:Q, raw, exr:half or exr:float.")
+@click.option("--twice", is_flag=True, help="At twice the heights' resolution: also between them, on predicted ground.")
+@click.option("--codec", default="png", show_default=True, help="png, jpeg:Q, webp:Q, raw, exr:half or exr:float.")
 @click.option("--bits", type=click.Choice(["8", "16"]), default="8", show_default=True, help="Bits of a sample of png and raw.")
 @click.option("--block", type=int, help="Side of a block in samples.  [default: that of the heights]")
 @click.option("--soft/--hard", default=False, show_default=True, help="Shadows of the sun's disc, or of a point.")
@@ -63,10 +72,24 @@ def parse_times(context: click.Context, parameter: click.Parameter, values: tupl
 @click.option("--albedo", type=float, default=0.3, show_default=True, help="Share of its light that the ground reflects.")
 @click.option("--curvature/--no-curvature", default=True, show_default=True, help="The ground is curved.")
 @click.option("--refraction/--no-refraction", default=False, show_default=True, help="The air lifts the sun and bends its rays.")
+@click.option(
+    "--scene", "scene_file", metavar="SCENE", help="A scene (TOML or JSON) with sun, sky and tolerance, instead of their options."
+)
+@click.option(
+    "--effects",
+    type=click.Choice(["all", "auto"]),
+    help="Simulate all that is asked for, or of it what heights and sun call for.  [default: all; auto with --scene]",
+)
+@click.option(
+    "--tolerance", type=float, metavar="CODES", help="What --effects auto may leave out, in codes of light, of 255.  [default: 1]"
+)
+@click.option("--plan", "only_plan", is_flag=True, help="Say which effects are called for and what the build would take; write nothing.")
 @click.option("--update", is_flag=True, help="The heights have changed: rebuild only what that changes.")
 @click.option("--overwrite", is_flag=True, help="Replace the layer; it is served until the new one is done.")
 @click.option("--records/--no-records", default=True, show_default=True, help="Keep what --update needs.")
 @click.option("--break-lock", is_flag=True, help="Take over the lock of a build in an object store that gives no sign of life.")
+@click.option("--engine", type=click.Choice(["local", "dask"]), default="local", show_default=True, help="Where tasks run.")
+@click.option("--scheduler", metavar="tcp://HOST:PORT", help="Scheduler of the Dask cluster that tasks run on.")
 @click.option("--workers", type=int, help="Threads; no effect on the result.  [default: all processors]")
 @click.option("--task", type=int, help="Side of a task in samples; no effect on the result.")
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
@@ -75,44 +98,74 @@ def command(
     suns: list[Sun],
     times: list[Sun],
     layer: str,
+    scene_file: str | None,
+    effects: str | None,
+    tolerance: float | None,
+    only_plan: bool,
+    engine: str,
+    scheduler: str | None,
     as_json: bool,
     **options: Any,  # noqa: ANN401 - click's options, checked by LightSettings
 ) -> None:
     """Build a layer of light in DATASET: its heights as a sun shines on them, with the shadows that they cast.
 
-    A sample of light lies on every sample of the heights. The layer has a pyramid of its own, filtered in linear light. An interrupted
-    build goes on when the same command is given again; if the heights have changed, --update rebuilds what that changes.
+    A sample of light lies on every sample of the heights, with --twice also between them. The layer has a pyramid of its own, filtered in
+    linear light. An interrupted build goes on when the same command is given again; if the heights have changed, --update rebuilds what
+    that changes.
+
+    --effects auto measures the heights first, and leaves out what is proved to change no sample by more than the tolerance.
 
     \b
     clipmap light out/alps --sun 270,10
     clipmap light out/alps --when 2026-06-21T05:00:00Z --soft --sky 16 --bounce
     clipmap light out/alps --sun 90,20 --sun 180,45 --sun 270,20 --layer day
+    clipmap light out/alps --sun 270,10 --soft --sky 16 --bounce --effects auto --plan
     """
-    chosen = [*suns, *times]
+    scene = None if scene_file is None else read_scene(scene_file)
+    effects = effects or ("all" if scene is None else "auto")
+    refuse_contradictions(click.get_current_context(), scene, effects)
+    chosen = [*suns, *times] if scene is None else [sun_of(scene)]
     if not chosen:
-        raise UsageError("give a sun: --sun AZ,EL or --when TIME")
+        raise UsageError("give a sun: --sun AZ,EL or --when TIME, or --scene SCENE")
     names = [layer] if len(chosen) == 1 else [f"{layer}_{number}" for number in range(1, len(chosen) + 1)]
     settings = [light_settings({**options, **sun, "layer": name}) for name, sun in zip(names, chosen, strict=True)]
+    wanted = [wanted_of(each, scene, effects, tolerance) for each in settings]
+    if only_plan:
+        show_light_plan(dataset, wanted, as_json)
+        return
+    lit = []
+    with open_engine(engine, scheduler) as runner:
+        for one in wanted:
+            lit.append(_light(dataset, one, runner))
+            if not as_json:
+                _show(*lit[-1], dataset)
+    if as_json:
+        version = lit[-1][0].build.manifest.version
+        emit_json({"dataset": dataset, "version": version, "layers": [_as_json(*each) for each in lit]})
+
+
+def _light(dataset: str, wanted: Wanted, engine: "Engine | None") -> "Lit":
+    """Build one layer, and return what was done, and what was left out if that was planned."""
     from tiler.building.light import build_light
 
-    reports = []
-    for each in settings:
-        with progress_bar("blocks") as on_progress:
-            reports.append(build_light(dataset, each, on_progress))
-        if not as_json:
-            _show(reports[-1], dataset)
-    if as_json:
-        emit_json({"dataset": dataset, "version": reports[-1].build.manifest.version, "layers": [_as_json(report) for report in reports]})
+    with progress_bar("blocks") as on_progress:
+        if wanted.scene is None:
+            return build_light(dataset, wanted.settings, on_progress, engine=engine), None
+        from tiler.building.lightplan import EffectChoice
+
+        choice = EffectChoice(wanted.scene, on_progress)
+        report = build_light(dataset, wanted.settings, on_progress, engine=engine, choose=choice)
+    return replace(report, stages_s={"plan": choice.wall_s, **report.stages_s}), choice
 
 
 def light_settings(options: dict[str, Any]) -> LightSettings:
     """Return the settings that the command's options give; raises UsageError that names the option which is wrong."""
-    soft, certified, none = (options.pop(name) for name in ("soft", "certified", "no_shadows"))
+    soft, certified, none, twice = (options.pop(name) for name in ("soft", "certified", "no_shadows", "twice"))
     if soft + certified + none > 1:
         raise UsageError("--soft, --certified and --no-shadows are three kinds of shadows; give one")
     shadows = "soft" if soft else "certified" if certified else "none" if none else "hard"
     try:
-        return LightSettings(**{**options, "shadows": shadows, "bits": int(options["bits"])})
+        return LightSettings(**{**options, "shadows": shadows, "bits": int(options["bits"]), "density": 2 if twice else 1})
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         name = str(first["loc"][0]) if first["loc"] else "options"
@@ -120,7 +173,7 @@ def light_settings(options: dict[str, Any]) -> LightSettings:
         raise UsageError(f"--{option}: {first['msg'].removeprefix('Value error, ')}") from error
 
 
-def _as_json(report: "LightReport") -> dict[str, Any]:
+def _as_json(report: "LightReport", choice: "EffectChoice | None") -> dict[str, Any]:
     build = report.build
     layer = build.manifest.layers[build.layer]
     return {
@@ -138,6 +191,7 @@ def _as_json(report: "LightReport") -> dict[str, Any]:
         "wall_s": build.wall_s,
         "stages_s": stages_s(report),
         "peak_rss_bytes": build.peak_rss_bytes,
+        **({} if choice is None else choice_json(choice)),
     }
 
 
@@ -147,15 +201,16 @@ def stages_s(report: "LightReport") -> dict[str, float]:
     return {**report.stages_s, "blocks": build.wall_s - sum(report.stages_s.values())}
 
 
-def _show(report: "LightReport", dataset: str) -> None:
+def _show(report: "LightReport", choice: "EffectChoice | None", dataset: str) -> None:
     build = report.build
     layer = build.manifest.layers[build.layer]
     for remark in build.remarks:
         click.echo(f"note: {remark}", err=True)
     pairs = [
         ("layer", f"{build.layer} in {dataset}, {build.outcome}"),
-        ("sun", _sun_text(report.light)),
-        ("effects", _effects_text(report.light)),
+        ("sun", sun_text(report.light)),
+        ("effects", effects_text(report.light)),
+        *([] if choice is None else choice_pairs(choice)),
         ("samples", f"{layer.width} x {layer.height}, {len(layer.levels)} levels"),
         ("blocks", f"{sum(level.stored for level in layer.levels)} stored, {build.blocks_written} written, {layer.codec}"),
         ("stored", format_bytes(sum(level.stored_bytes for level in layer.levels))),
@@ -165,21 +220,3 @@ def _show(report: "LightReport", dataset: str) -> None:
     if report.light.voids:
         pairs.append(("voids", f"{report.light.voids} samples: no light on them, and no shadow of them"))
     emit_pairs(pairs)
-
-
-def _sun_text(light: "Light") -> str:
-    text = f"azimuth {light.azimuth_deg:.2f}, elevation {light.elevation_deg:.2f} degrees"
-    if light.when is not None:
-        text += f", at {light.when}"
-    return text if light.elevation_deg > 0 else f"{text}: below the horizon"
-
-
-def _effects_text(light: "Light") -> str:
-    effects = [
-        {"none": "no shadows", "hard": f"hard shadows ({light.lines} per sample)"}.get(light.shadows, f"{light.shadows} shadows"),
-        f"sky ({light.sky_azimuths} azimuths)" if light.sky_share else "",
-        "bounce" if light.albedo else "",
-        "curvature" if light.radius_m is not None else "",
-        "refraction" if light.refraction else "",
-    ]
-    return ", ".join(effect for effect in effects if effect)

@@ -63,6 +63,13 @@ def parse_size(_: click.Context, __: click.Parameter, value: str) -> tuple[int, 
 @click.option("--no-light", is_flag=True, help="Show imagery as it is, without a sun.")
 @click.option("--haze", type=float, metavar="KM", help="Distance in km at which haze hides 63 %; off by default.")
 @click.option(
+    "--curvature",
+    type=click.Choice(["auto", "on", "off"]),
+    default="auto",
+    show_default=True,
+    help="Let distant ground sink as on a globe; auto: where the dataset lies on the Earth and it would be seen.",
+)
+@click.option(
     "--grid", type=click.Choice(["63", "127", "255", "511"]), default="255", show_default=True, help="Vertices on a side of a level."
 )
 @click.option(
@@ -76,7 +83,12 @@ def parse_size(_: click.Context, __: click.Parameter, value: str) -> tuple[int, 
 @click.option("--wireframe", is_flag=True, help="Draw edges only.")
 @click.option("--color-by-level", is_flag=True, help="Tint by level of detail.")
 @click.option("--height", "height_layer", metavar="NAME", help="Height layer, if there are several.")
-@click.option("--imagery", "imagery_layer", metavar="NAME", help="Imagery layer, if there are several.")
+@click.option(
+    "--imagery",
+    "imagery_layer",
+    metavar="NAME",
+    help="Imagery layer, if there are several; or one of light, or of normals, which shade the ground.",
+)
 @click.option("--workers", type=click.IntRange(1, 64), default=4, show_default=True, help="Threads that load and decode blocks.")
 @click.option("--json", "as_json", is_flag=True, help="Report as JSON.")
 def command(dataset: str, **given: Any) -> None:  # noqa: ANN401 - click passes options by name
@@ -118,6 +130,7 @@ def _options(given: dict[str, Any]) -> "ViewOptions":
         exaggeration=given["exaggeration"],
         sun_deg=None if given["no_light"] else given["sun"],
         haze_m=None if given["haze"] is None else given["haze"] * 1000.0,
+        curvature=given["curvature"],
         grid=int(given["grid"]),
         texture_window=int(given["texture_window"]),
         samples=given["samples"],
@@ -190,6 +203,7 @@ def _render(scene: "Scene", options: "ViewOptions", camera: "Camera", paths: lis
             ("blocks", f"{scene.loader.counts.blocks}, {format_bytes(scene.loader.counts.fetched_bytes)}"),
             ("loading", f"{1e3 * sum(picture.load_s for picture in pictures):.0f} ms"),
             ("drawing", f"{1e3 * sum(picture.draw_s for picture in pictures) / len(pictures):.0f} ms a frame"),
+            *((effect.name, effect.text) for effect in first.effects.all),
         ]
     )
 
@@ -201,6 +215,10 @@ def _picture(picture: "Picture", view: str) -> dict[str, Any]:
         "triangles": picture.triangles,
         "load_s": round(picture.load_s, 6),
         "draw_s": round(picture.draw_s, 6),
+        "effects": [
+            {"name": one.name, "runs": one.runs, "bound": one.bound if math.isfinite(one.bound) else None, "unit": one.unit, "why": one.why}
+            for one in picture.effects.all
+        ],
     }
 
 

@@ -11,7 +11,7 @@ from schemas.effects import EffectPlan, EffectProof
 from schemas.estimates import BuildEstimate
 from schemas.facts import BlockFacts, DatasetFacts, LayerFacts, LevelFacts, PointFacts
 from schemas.findings import DiffReport, VerifyReport
-from schemas.manifest import Model
+from schemas.model import Model
 
 TARGET = Path(__file__).parents[1] / "reports.schema.json"
 

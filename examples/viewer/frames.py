@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from viewer.camera import Camera, Matrix
 from viewer.clipmap import GeometryClipmap, TextureClipmap, Update, finest_level
 from viewer.drawplan import GeometryPlan, plan_geometry, texture_records
+from viewer.effects import View, ViewEffects, decide_effects
 from viewer.frustum import Culling, planes_of
 from viewer.options import ViewOptions
 from viewer.scene import Scene
@@ -39,6 +41,8 @@ class Frame:
     """Finest geometry level drawn."""
     settled: bool
     """Whether every window was where the camera wants it."""
+    effects: ViewEffects
+    """What is drawn of haze and curvature, and why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,11 +89,14 @@ class FrameMaker:
         image_update, records, image_edge = self._update_textures(viewer, above_m, pixels, budget)
         self._request(update, image_update)
         origins: list[Origin] = [geometry.wanted_origin(viewer, level) for level in range(geometry.levels)]
-        matrix = self._view_projection(camera, size[0] / size[1])
+        view = self._view(camera, size)
+        effects = decide_effects(view, self._options)
+        z_range = self._z_range[0] - effects.sag_per_m * view.farthest_m**2 - camera.z_m, self._z_range[1] - camera.z_m
+        matrix = self._view_projection(camera, size[0] / size[1], z_range)
         culling = Culling(
             planes_of(matrix) @ _translation(held.x_m - camera.x_m, held.y_m - camera.y_m),
             scene.frame.to_local.linear,
-            (self._z_range[0] - camera.z_m, self._z_range[1] - camera.z_m),
+            z_range,
             viewer,
             origins,
             geometry.n,
@@ -99,7 +106,7 @@ class FrameMaker:
         last = scene.heights.extent(0)
         edge = last.x0 - viewer[0], last.y0 - viewer[1], last.x1 - 1 - viewer[0], last.y1 - 1 - viewer[1]
         settled = update.settled and (image_update is None or image_update.settled)
-        return Frame(camera, size, plan, records, matrix, origin, edge, image_edge, update.active, settled)
+        return Frame(camera, size, plan, records, matrix, origin, edge, image_edge, update.active, settled, effects)
 
     @property
     def written_samples(self) -> int:
@@ -132,17 +139,40 @@ class FrameMaker:
         wanted.sort(key=lambda pair: (pair[0].ahead, pair[0].depth, pair[0].layer))
         self.missing = self._scene.loader.request(key for _, key in wanted)
 
-    def _view_projection(self, camera: Camera, aspect: float) -> Matrix:
-        """Return the matrix; the depth range spans from the nearest ground there can be to the farthest corner of the dataset."""
+    def _view(self, camera: Camera, size: tuple[int, int]) -> View:
+        """Return what bounds of effects need to know of a picture."""
+        beside = self._corners - (camera.x_m, camera.y_m)
+        farthest = float(np.hypot(*beside.T).max())
+        high = max(abs(z - camera.z_m) for z in self._z_range)
         scene = self._scene
-        extent = scene.heights.extent(0)
-        corners = np.array([scene.frame.to_local(x, y) for x in (0, extent.width - 1) for y in (0, extent.height - 1)])
-        beside = corners - (camera.x_m, camera.y_m)
-        z = np.array([self._z_range[0] - camera.z_m, self._z_range[1] - camera.z_m])
-        far = float(np.sqrt((beside**2).sum(axis=1).max() + (z**2).max())) * 1.01
+        return View(
+            size,
+            camera.pixels_per_radian(size[1]),
+            farthest,
+            math.hypot(farthest, high),
+            self._z_range[1] - self._z_range[0],
+            scene.frame.spacing_m,
+            scene.heights.levels,
+            scene.manifest.world.crs is not None,
+        )
+
+    @cached_property
+    def _corners(self) -> Matrix:
+        """The corners of the dataset (4, 2) [local metres]."""
+        extent, place = self._scene.heights.extent(0), self._scene.frame.to_local
+        return np.array([place(x, y) for x in (0, extent.width - 1) for y in (0, extent.height - 1)])
+
+    def _view_projection(self, camera: Camera, aspect: float, z_range_m: tuple[float, float]) -> Matrix:
+        """Return the matrix; the depth range spans from the nearest ground there can be to the farthest corner of the dataset.
+
+        ``z_range_m`` are the heights that occur, relative to the camera.
+        """
+        beside = self._corners - (camera.x_m, camera.y_m)
+        low, high = z_range_m
+        far = math.sqrt(float((beside**2).sum(axis=1).max()) + max(low**2, high**2)) * 1.01
         outside = np.maximum(np.maximum(beside.min(axis=0), -beside.max(axis=0)), 0.0)
-        nearest = max(self._above_ground(camera), float(np.hypot(*outside)), -z[1], z[0])
-        near = max(NEAR_PART * nearest, 2e-7 * far, 1e-3 * scene.frame.spacing_m)
+        nearest = max(self._above_ground(camera), float(np.hypot(*outside)), -high, low)
+        near = max(NEAR_PART * nearest, 2e-7 * far, 1e-3 * self._scene.frame.spacing_m)
         return camera.view_projection(aspect, near, max(far, 2 * near))
 
 

@@ -1,10 +1,12 @@
 """What a view is told: frozen, checked once, passed in."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 from schemas.errors import UsageError
 from viewer.placement import check_grid
 
+Choice = Literal["auto", "on", "off"]
 TEXTURE_WINDOWS = (256, 512, 1024, 2048, 4096)
 
 
@@ -21,7 +23,9 @@ class ViewOptions:
     sun_deg: tuple[float, float] | None = (315.0, 40.0)
     """Azimuth, clockwise from north, and elevation of the sun [degrees]; None: no shading."""
     haze_m: float | None = None
-    """Distance at which haze hides 63 % [m]; None: no haze."""
+    """Distance at which haze hides 63 % [m]; None: no haze. Not drawn where nobody could see it."""
+    curvature: Choice = "auto"
+    """Whether distant ground sinks below the horizon; auto: where a dataset lies on the Earth and it can be seen."""
     grid: int = 255
     """Vertices along a side of a geometry level."""
     texture_window: int = 1024

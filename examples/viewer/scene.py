@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas.errors import UsageError
 from schemas.manifest import Layer, LayerKind, Manifest
@@ -24,11 +25,16 @@ OVERVIEW_SIDE: Final = 512
 
 @dataclass(frozen=True)
 class Imagery:
-    """The imagery layer and the map from level-0 height samples to its level-0 texels."""
+    """The imagery layer and the map from level-0 height samples to its level-0 texels; normals are drawn as the ground's shading."""
 
     layer: Layer
     pyramid: Pyramid
     to_texels: Affine
+
+    def facing(self, frame: LocalFrame) -> NDArray[np.float64]:
+        """Return the unit vectors (east, north), as columns, of increasing columns and of decreasing rows, in which normals are told."""
+        steps = frame.to_local.linear @ np.linalg.inv(self.to_texels.linear)
+        return np.asarray(steps / np.hypot(*steps) * (1.0, -1.0), np.float64)
 
 
 @dataclass(frozen=True)
@@ -138,7 +144,7 @@ def _any(named: _Named | None) -> _Named:
 def _choose(manifest: Manifest, kind: LayerKind, name: str | None) -> _Named | None:
     if name is not None:
         layer = manifest.layer(name)
-        is_drawn_alike = (kind, layer.kind) == ("imagery", "light")
+        is_drawn_alike = kind == "imagery" and layer.kind in ("light", "normal")
         if layer.kind != kind and not is_drawn_alike:
             raise UsageError(f"layer {name!r} is of kind {layer.kind}, not {kind}")
         return name, layer

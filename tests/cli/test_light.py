@@ -64,7 +64,7 @@ def test_several_suns_become_several_layers(clipmap: Clipmap, dataset: Path) -> 
         (("--when", "2026-06-21T12:00:00"), "add the offset from UTC"),
         (("--sun", "1,1", "--soft", "--certified"), "are three kinds of shadows; give one"),
         (("--sun", "1,1", "--lines", "0"), "--lines: Input should be greater than or equal to 1"),
-        (("--sun", "1,1", "--codec", "webp"), "light is stored as png, jpeg, raw, exr"),
+        (("--sun", "1,1", "--codec", "rgb565"), "light is stored as png, jpeg, webp, raw, exr"),
         (("--sun", "1,1", "--layer", "height"), "is there and no light; choose another name"),
         (("--sun", "1,1", "--layer", "Light!"), "use lower-case letters"),
     ],

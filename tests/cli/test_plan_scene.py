@@ -88,28 +88,37 @@ def test_the_proof_in_words(island: Path, tmp_path: Path, clipmap: Clipmap) -> N
     assert "BROKEN" not in ran.out
 
 
-def test_what_an_estimate_hides_is_found(tmp_path: Path, clipmap: Clipmap) -> None:
-    """A tower of one sample, which the coarse level does not have: its shadow is left out, and seen to be missing."""
+def test_a_tower_is_no_estimates_business(tmp_path: Path, clipmap: Clipmap) -> None:
+    """One sample, which the coarse level does not have: its shadow stays, and so does the sky it hides."""
     heights = np.zeros((500, 500), np.float32)
     heights[251, 250] = 40.0
-    tower = dataset(tmp_path, heights, 10.0)
-    given = scene(tmp_path)
-    ran = clipmap("plan", given, tower, "--prove", "--crop", "80")
+    ran = clipmap("plan", scene(tmp_path), dataset(tmp_path, heights, 10.0), "--prove", "--crop", "80", "--estimate")
+    assert ran.code == 0
+    assert "skip estimated" not in ran.out
+
+
+def test_what_an_estimate_hides_is_found(tmp_path: Path, clipmap: Clipmap) -> None:
+    """Pits where no sample of the coarse level is, and a scarp as steep as they are, so that nothing tells of them."""
+    heights = np.zeros((500, 500), np.float32)
+    heights[1::3, 1::3] = -3.0
+    heights[:, 400:] = -5.0 * np.arange(100, dtype=np.float32)
+    given, pitted = scene(tmp_path, SUN.replace("30", "60")), dataset(tmp_path, heights, 10.0)
+    ran = clipmap("plan", given, pitted, "--prove", "--crop", "120", "--estimate")
     assert ran.code == 1
     assert "skip estimated" in ran.out
     assert "Every bound holds, but what was left out by an estimate is seen; --no-estimate simulates it." in ran.out
-    ran = clipmap("plan", given, tower, "--prove", "--crop", "80", "--no-estimate")
+    ran = clipmap("plan", given, pitted, "--prove", "--crop", "120")
     assert ran.code == 0
     assert "skip estimated" not in ran.out
 
 
 def test_the_scene_decides_about_estimates(island: Path, tmp_path: Path, clipmap: Clipmap) -> None:
-    without = scene(tmp_path, SUN + "[tolerance]\nestimates = false\n")
+    allowed = scene(tmp_path, SUN + "[tolerance]\nestimates = true\n")
     estimates = []
     for arguments in ([], ["--estimate"], ["--no-estimate"]):
-        plan = json.loads(clipmap("plan", without, island, "--json", *arguments).out)
-        estimates.append(plan["effects"][0]["estimate"] is not None)
-    assert estimates == [False, True, False]
+        plan = json.loads(clipmap("plan", allowed, island, "--json", *arguments).out)
+        estimates.append([one["effect"] for one in plan["effects"] if one["estimate"] is not None])
+    assert estimates == [["sky", "bounce"], ["sky", "bounce"], []]
 
 
 def test_a_time_instead_of_angles(island: Path, tmp_path: Path, clipmap: Clipmap) -> None:
@@ -168,6 +177,8 @@ def test_other_mistakes(plain: Path, survey: Path, tmp_path: Path, clipmap: Clip
         ([given, plain, "--layer", "light"], 3, "light"),
         ([given, survey, "--layer", "imagery"], 2, "is of kind imagery"),
         ([given, plain, "--crop", "0"], 2, "--crop"),
+        ([given, plain, "--crop", "64"], 2, "--crop says how much --prove bakes; give --prove as well"),
+        (["--example", "--crop", "64"], 2, "--crop says how much"),
         ([tmp_path, plain], 4, "cannot be read"),
         ([tmp_path / "latin.toml", plain], 3, "is not UTF-8"),
     ]

@@ -54,7 +54,12 @@ class Case:
 
     def blocks(self) -> list[tuple[Samples, Mask | None]]:
         """Blocks to encode: two ordinary ones first, then constant, noisy, steep and extreme ones; heights also with voids."""
-        return _height_blocks(self.block.side, self.spec) if self.block.kind == "height" else _imagery_blocks(self.block)
+        if self.block.dtype != "float32":
+            return _imagery_blocks(self.block)
+        found = _height_blocks(self.block.side, self.spec)
+        return (
+            [(np.concatenate([samples, -samples[::-1]], axis=-1), mask) for samples, mask in found] if self.block.channels == 2 else found
+        )
 
 
 def _height_blocks(side: int, spec: str) -> list[tuple[Samples, Mask | None]]:
@@ -107,12 +112,14 @@ def _formats(spec: str, side: int) -> list[BlockFormat]:
 
     name = spec.partition(":")[0]
     height = [BlockFormat("height", side, 1, "float32")]
+    normals = [BlockFormat("normal", side, 2, "float32")]
     return {
         "jpeg": pictures((1, 3), "uint8"),
         "png": pictures((1, 2, 3, 4), "uint8", "uint16"),
-        "webp": pictures((3, 4), "uint8"),
+        "webp": pictures((3, 4), "uint8") + [BlockFormat("light", side, count, "uint8", count == 2) for count in (1, 2)],
         "rgb565": pictures((3,), "uint8"),
         "raw": pictures((1, 2, 3, 4), "uint8", "uint16") + height,
+        "exr": height + normals,
     }.get(name, height)
 
 

@@ -203,7 +203,7 @@ def test_the_layout_is_that_of_vips(kind: str, overlap: int, folder: Path, tmp_p
 
 def test_heights_are_refused(folder: Path, tmp_path: Path) -> None:
     build("lerc", folder)
-    with pytest.raises(UsageError, match="heights are no pictures; export them as cog or exr"):
+    with pytest.raises(UsageError, match="heights and normals are no pictures; export them as cog or exr"):
         exported(folder / "lerc" / "out", "dzi", tmp_path / "heights.dzi")
     assert not list(tmp_path.iterdir())
 

@@ -111,11 +111,14 @@ def test_c46_the_terminator_of_a_dome(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("half_angle", [30.0, 45.0, 70.0])
 def test_c47_the_sky_from_the_bottom_of_a_conical_pit(half_angle: float, tmp_path: Path) -> None:
-    """The sky is a cone about the zenith: its cosine-weighed share is the squared sine of the half angle."""
-    side = 129
+    """The sky is a cone about the zenith: its cosine-weighed share is the squared sine of the half angle.
+
+    The bottom is level: beside a sharp one samples are joined by lines that are up to 8 % higher than a cone.
+    """
+    side, floor = 129, 24
     rows, columns = np.mgrid[0:side, 0:side] - (side - 1) / 2
-    heights = CELL_M * np.hypot(rows, columns) / math.tan(math.radians(half_angle))
-    heights = np.minimum(heights, heights[side // 2, 0])
+    share = (np.minimum(np.hypot(rows, columns), side // 2) - floor).clip(0) / (side // 2 - floor)
+    heights = CELL_M * share * (side // 2) / math.tan(math.radians(half_angle))
     found = lit(store_heights(tmp_path, heights), 0, -90, sky=32, share=1.0)
     assert 2 * found[side // 2, side // 2] == pytest.approx(math.sin(math.radians(half_angle)) ** 2, abs=0.01)
 
@@ -193,7 +196,9 @@ def test_voids_have_no_light_and_shade_nothing(tmp_path: Path) -> None:
     assert verify(open_dataset(dataset)).findings == []
 
 
-@pytest.mark.parametrize(("codec", "bits"), [("png", 8), ("png", 16), ("jpeg:95", 8), ("raw", 16), ("exr:half", 8), ("exr:float", 8)])
+@pytest.mark.parametrize(
+    ("codec", "bits"), [("png", 8), ("png", 16), ("jpeg:95", 8), ("webp:95", 8), ("raw", 16), ("exr:half", 8), ("exr:float", 8)]
+)
 def test_codes_are_the_srgb_encoding_of_light(codec: str, bits: int, tmp_path: Path) -> None:
     dataset = store_heights(tmp_path, rough())
     exact = lit(dataset, 300, 35)
@@ -207,7 +212,7 @@ def test_codes_are_the_srgb_encoding_of_light(codec: str, bits: int, tmp_path: P
     assert layer.filter.linear_light
     top = 2**bits - 1
     expected = top * np.where(exact <= 0.0031308, 12.92 * exact, 1.055 * exact ** (1 / 2.4) - 0.055)
-    assert np.abs(found - expected).max() < (0.51 if codec != "jpeg:95" else 25)
+    assert np.abs(found - expected).max() < (25 if ":95" in codec else 0.51)
 
 
 def test_nothing_depends_on_workers_tasks_or_how_it_was_cut(tmp_path: Path) -> None:

@@ -6,8 +6,9 @@ import numpy as np
 
 from tests.reference.kernels import Array
 
-Edge = Literal["antisymmetric", "mirror"]
-"""``antisymmetric``: reflection through the edge sample, for heights. ``mirror``: half-sample mirror, for imagery."""
+Edge = Literal["antisymmetric", "mirror", "mirror-sample"]
+"""``antisymmetric``: reflection through the edge sample, for heights. ``mirror``: half-sample mirror, for imagery. ``mirror-sample``:
+mirror at the edge sample, for light and normals."""
 
 
 def extend(values: Array, coverage: Array, margin: tuple[int, int], edge: Edge) -> tuple[Array, Array]:
@@ -22,7 +23,7 @@ def extend(values: Array, coverage: Array, margin: tuple[int, int], edge: Edge) 
 
 def _extend_rows(values: Array, coverage: Array, margin: tuple[int, int], edge: Edge) -> tuple[Array, Array]:
     before, after = margin
-    row = _antisymmetric_row if edge == "antisymmetric" else _mirrored_row
+    row = {"antisymmetric": _antisymmetric_row, "mirror": _mirrored_row, "mirror-sample": _folded_row}[edge]
     rows = [row(values, coverage, m) for m in range(-before, len(values) + after)]
     return np.stack([value for value, _ in rows]), np.stack([cover for _, cover in rows])
 
@@ -48,3 +49,11 @@ def _mirrored_row(values: Array, coverage: Array, m: int) -> tuple[Array, Array]
     if 0 <= m < n:
         return values[m], coverage[m]
     return _mirrored_row(values, coverage, -1 - m if m < 0 else 2 * n - 1 - m)
+
+
+def _folded_row(values: Array, coverage: Array, m: int) -> tuple[Array, Array]:
+    """Row ``m``: z[-k] = z[k] and z[n-1+k] = z[n-1-k], again and again until inside. A single row is repeated."""
+    last = len(values) - 1
+    if last == 0 or 0 <= m <= last:
+        return values[min(max(m, 0), last)], coverage[min(max(m, 0), last)]
+    return _folded_row(values, coverage, -m if m < 0 else 2 * last - m)

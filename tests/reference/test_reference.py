@@ -16,7 +16,8 @@ BLACKMAN = "blackman-sinc"
 Setting = tuple[Registration, Edge, int]
 HEIGHTS: Setting = ("point", "antisymmetric", 6)
 IMAGERY: Setting = ("area", "mirror", 3)
-SETTINGS = pytest.mark.parametrize(("registration", "edge", "radius"), [HEIGHTS, IMAGERY, ("point", "mirror", 3)])
+LIGHT: Setting = ("point", "mirror-sample", 3)
+SETTINGS = pytest.mark.parametrize(("registration", "edge", "radius"), [HEIGHTS, IMAGERY, LIGHT, ("point", "mirror", 3)])
 
 
 @SETTINGS
@@ -48,7 +49,14 @@ def test_mirror_edge_by_hand() -> None:
     assert cover[0, :, 0].tolist() == (extended[0, :, 0] / 5).tolist()
 
 
-@pytest.mark.parametrize("edge", ["antisymmetric", "mirror"])
+def test_sample_mirror_edge_by_hand() -> None:
+    values, cover = np.array([[[3.0], [5.0], [9.0]]]), np.array([[[1.0], [0.5], [0.0]]])
+    extended, weight = extend(values, cover, (2, 5), "mirror-sample")
+    assert extended[0, :, 0].tolist() == [9, 5, 3, 5, 9, 5, 3, 5, 9, 5]
+    assert weight[0, :, 0].tolist() == [0, 0.5, 1, 0.5, 0, 0.5, 1, 0.5, 0, 0.5]
+
+
+@pytest.mark.parametrize("edge", ["antisymmetric", "mirror", "mirror-sample"])
 def test_a_single_sample_is_repeated(edge: Edge) -> None:
     extended, _ = extend(np.full((1, 1, 2), 7.0), np.ones((1, 1, 1)), (5, 6), edge)
     assert extended.shape == (12, 12, 2)

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cli.main import run
+from schemas.scene import SUN_RADIUS_DEG
 from tests.reference.shadows import horizon_tangents, shadow_margins, step_toward
 from tests.reference.terrain import photo, terrain
 from tiler.accuracy.lightexperiments import LINES, STEPS, SUNS, LightResult, light_frontier, measure_lights
@@ -23,7 +24,7 @@ from tiler.accuracy.lightprecision import measure_light_precision, plain_sweep
 from tiler.accuracy.lightreport import LightReport, light_section
 from tiler.accuracy.lightwalk import walked_horizons, walked_lit
 from tiler.accuracy.sample import built_in
-from tiler.light.disc import SUN_RADIUS_DEG, disc_coverage
+from tiler.light.disc import disc_coverage
 from tiler.light.frame import SunPosition, frame_of, tangent_deg
 from tiler.light.shadow import cast_shadow
 from tiler.light.sweeping import LIT
@@ -194,7 +195,7 @@ def test_the_command_measures_light(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert (tmp_path / "report" / "light.svg").stat().st_size > 10_000
     with (tmp_path / "report" / "light.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert {row["experiment"] for row in rows} == {"shadow", "horizon", "disc", "sky"}
+    assert {row["experiment"] for row in rows} == {"shadow", "horizon", "disc", "sky", "bounce"}
     assert {row["frontier"] for row in rows} == {"True", "False"}
 
 

@@ -9,6 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from schemas import viewbounds
 from tests.reference import effects as reference
 from tests.unit.effect_terrains import Case, cases
 from tiler.effects import bounds
@@ -267,9 +268,9 @@ def test_filtering_in_gamma_space(seed: int, size: int, span: float, lobes: floa
 
 @given(st.floats(0, 255), st.floats(0, 255))
 def test_encoding_stretches_no_difference_more_than_next_to_black(a: float, b: float) -> None:
-    difference = abs(bounds.srgb_codes(a) - bounds.srgb_codes(b))
-    assert difference <= bounds.srgb_codes(abs(a - b)) + 1e-5
-    assert bounds.linear_codes(bounds.srgb_codes(a)) == pytest.approx(a, abs=1e-5)
+    difference = abs(viewbounds.srgb_codes(a) - viewbounds.srgb_codes(b))
+    assert difference <= viewbounds.srgb_codes(abs(a - b)) + 1e-5
+    assert viewbounds.linear_codes(viewbounds.srgb_codes(a)) == pytest.approx(a, abs=1e-5)
 
 
 def test_a_sun_turned_with_the_vertical() -> None:

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from schemas import viewbounds
 from schemas.effects import EffectName, EffectPlan
 from schemas.errors import InputError, UsageError
 from schemas.scene import Effects, Ground, Scene, Sun, Tolerance
@@ -128,19 +129,24 @@ def test_hard_shadows_are_judged_by_the_suns_direction() -> None:
     assert plan_effects(scene_of(case), measured(case)).effect("curvature_shadow").unit == "codes"
 
 
-def test_estimates_are_marked_and_can_be_refused() -> None:
-    """One sheer sample, which a coarse level does not show, ends the proof for the map. By proof alone, a few tiles are simulated."""
+def test_estimates_are_marked_and_have_to_be_allowed() -> None:
+    """Hills so gentle that the sky they hide is nothing, but not by proof: in a pit as steep all around it would be seen."""
+    case = rolling(500.0, side=1000, elevation=40.0)
+    proved, estimated = (plan_effects(scene_of(case, tolerance=Tolerance(estimates=yes)), measured(case)) for yes in (False, True))
+    assert (proved.effect("sky").verdict, proved.effect("sky").estimate, proved.estimated) == ("run", None, False)
+    assert estimated.effect("sky").verdict == "skip estimated"
+    assert estimated.estimated
+    assert any("estimate" in sentence for sentence in plan_sentences(estimated))
+    assert proved.effect("shadow").verdict == estimated.effect("shadow").verdict
+
+
+def test_one_sheer_sample_ends_proofs_and_estimates() -> None:
+    """A coarse level does not show it, but it is known of the finest; a few tiles are simulated."""
     case = rolling(20.0, side=1000, elevation=40.0)
     case.z[501, 500] += 60.0
-    plan = plan_effects(scene_of(case), measured(case))
-    assert plan.effect("shadow").verdict == "skip estimated"
-    assert plan.effect("shadow").estimate == 0
-    assert plan.estimated
-    assert any("estimate" in sentence for sentence in plan_sentences(plan))
-    proved = plan_effects(scene_of(case, tolerance=Tolerance(estimates=False)), measured(case))
-    assert proved.effect("shadow").verdict == "run"
-    assert not proved.estimated
-    assert proved.effect("shadow").share < 0.1
+    plan = plan_effects(scene_of(case, tolerance=Tolerance(estimates=True)), measured(case))
+    assert [plan.effect(name).verdict for name in ("shadow", "penumbra", "sky", "bounce")] == ["run"] * 4
+    assert plan.effect("shadow").share < 0.1
 
 
 def test_tiles_left_out_are_lit() -> None:
@@ -187,7 +193,7 @@ def test_srgb_codes_are_dearer() -> None:
         plan_effects(scene_of(case, tolerance=Tolerance(transfer=transfer)), measured(case)) for transfer in ("linear", "srgb")
     )
     assert linear.effect("sky").tolerance / encoded.effect("sky").tolerance == pytest.approx(12.92, rel=0.01)
-    assert bounds.srgb_codes(encoded.left_out_codes) <= 1
+    assert viewbounds.srgb_codes(encoded.left_out_codes) <= 1
 
 
 def test_a_plan_is_a_document_and_a_table() -> None:

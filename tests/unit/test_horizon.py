@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 
 from schemas.errors import UsageError
 from schemas.region import Rect
+from schemas.scene import SUN_RADIUS_DEG
 from tests.reference import shadows as reference
 from tests.reference.terrain import power_law_field
 from tests.unit.test_shadow import AZIMUTHS, CELLS, EARTHS, PARTS, rough_terrain, split, terrains
-from tiler.light.disc import SUN_RADIUS_DEG, disc_coverage
+from tiler.light.disc import disc_coverage
 from tiler.light.frame import Earth, SunPosition, curvature_per_m
 from tiler.light.horizons import HorizonSweep, angles_deg, horizon_tangents, sines
 from tiler.light.shadow import ShadowSweep, local_elevation_deg

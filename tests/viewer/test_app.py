@@ -104,6 +104,21 @@ def test_keys_fly_toggle_freeze_and_print(parts: tuple[App, FakeWindow, list[str
     app._scene.close()
 
 
+def test_effects_are_told_first_and_when_they_change(parts: tuple[App, FakeWindow, list[str]]) -> None:
+    app, _, lines = parts
+    settle(app)
+    told = list(lines)
+    assert told[0] == "haze left out: not asked for"
+    assert told[1].startswith("curvature left out: ")
+    assert told[2].startswith("geomorph drawn: it joins levels")
+    app.draw(0.0)
+    assert lines == told, "nothing has changed"
+    app._drawn["haze"] = True
+    app.draw(0.0)
+    assert lines == [*told, told[0]]
+    app._scene.close()
+
+
 def test_frozen_levels_stay_where_they_were(parts: tuple[App, FakeWindow, list[str]]) -> None:
     app, window, _ = parts
     settle(app)

@@ -54,6 +54,19 @@ def test_grey_becomes_colour_and_alpha_premultiplies() -> None:
     np.testing.assert_array_equal(image(rng.integers(0, 256, (16, 16, 2), np.uint8))[..., 3], 255)
 
 
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+def test_light_is_as_bright_however_it_is_stored(dtype: str) -> None:
+    """2026-11-23: 16 bits and floats were stretched to what occurs, and floats shown as if they were codes of sRGB."""
+    light = np.linspace(0.01, 0.6, 256).reshape(16, 16, 1)
+    codes = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    top = {"uint8": 255, "uint16": 65535}.get(dtype)
+    stored = light.astype(np.float32) if top is None else np.rint(top * codes).astype(dtype)
+    layer, files = build_layer(LayerSpec("light", "light", stored, TRANSFORM))
+    block = layer_decoder(layer)(files["light/0/light-0.raw"])
+    assert isinstance(block, ImageBlock)
+    assert np.abs(block.texels[..., :3] - 255 * codes).max() <= 0.51
+
+
 def test_sixteen_bits_are_stretched_to_what_occurs() -> None:
     samples = rng.integers(1000, 3000, (16, 16, 3)).astype(np.uint16)
     samples[0, 0], samples[0, 1] = 1000, 3000

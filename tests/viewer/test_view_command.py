@@ -38,6 +38,11 @@ def test_a_picture_is_written_and_reported(dataset: Path, tmp_path: Path, capsys
     assert report["pictures"][0]["triangles"] > 1000
     assert report["blocks"] > 10
     assert report["renderer"]
+    assert [(one["name"], one["runs"]) for one in report["pictures"][0]["effects"]] == [
+        ("haze", False),
+        ("curvature", False),
+        ("geomorph", True),
+    ]
     picture = imagecodecs.png_decode(out.read_bytes())
     assert picture.shape == (90, 160, 3)
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 200
@@ -47,6 +52,8 @@ def test_a_picture_is_written_and_reported(dataset: Path, tmp_path: Path, capsys
     )
     text = capsys.readouterr().out
     assert "triangles" in text
+    assert "haze       left out: not asked for\n" in text
+    assert "curvature  left out: it moves ground by up to " in text
     assert f"--view={report['pictures'][0]['view']}" in text
     difference = np.abs(imagecodecs.png_decode(again.read_bytes()).astype(int) - picture)
     assert np.median(difference) <= 1

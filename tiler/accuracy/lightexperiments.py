@@ -1,4 +1,7 @@
-"""Error and time of every way to find shadows, horizons, the sun's disc and the sky, against rays that were all walked in float64."""
+"""Error and time of every way to find shadows, horizons, the sun's disc, the sky and the light that the ground throws back.
+
+The reference is rays that were all walked in float64. What ``clipmap light`` runs is among the methods, by its options.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,18 +12,21 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.scene import SUN_RADIUS_DEG
 from tiler.accuracy.experiments import rms_of, timed
+from tiler.accuracy.lightbounce import direct_light, gathered_light, local_mean
 from tiler.accuracy.lightground import Ground, Margins, inner
 from tiler.accuracy.lightparts import disc_by_chords, disc_points, sky_share
+from tiler.accuracy.lightshipped import ShippedLight
 from tiler.accuracy.lightwalk import walked_horizons, walked_lit
 from tiler.light.certified import certified_shadow
-from tiler.light.disc import SUN_RADIUS_DEG, disc_coverage
+from tiler.light.disc import disc_coverage
 from tiler.light.frame import SunPosition, tangent_deg
 from tiler.light.horizons import horizon_tangents
 from tiler.light.shadow import cast_shadow
 from tiler.light.sweeping import LIT
 
-Experiment = Literal["shadow", "horizon", "disc", "sky"]
+Experiment = Literal["shadow", "horizon", "disc", "sky", "bounce"]
 Work = Callable[[], NDArray[Any]]
 Array = NDArray[np.float64]
 
@@ -35,6 +41,14 @@ REFERENCE_CHORDS: Final = 31
 DISC_SIDE: Final = 384
 SKY_SIDE: Final = 128
 """Samples along an edge that are compared; they see all of the ground. A reference walks 31 or 256 rays from each."""
+RADII: Final = (4, 16, 64, 256)
+GATHERED: Final = (4, 8, 16, 32, 64)
+BOUNCE_AZIMUTHS: Final = 16
+"""What ``clipmap light --bounce`` looks in for the share that is ground."""
+SHARE: Final = 0.15
+ALBEDO: Final = 0.3
+"""Light of the sky beside the sun's, and what the ground throws back of both: the command's defaults."""
+_MEAN_STEPS: Final = 1024
 _CODES: Final = 255
 
 
@@ -84,7 +98,10 @@ def measure_lights(ground: Ground, runs: int) -> list[LightResult]:
     results += measure_horizons(ground, SUNS[1][0], runs)
     for azimuth, elevation in SUNS:
         results += measure_discs(ground, SunPosition(azimuth, elevation), max(1, runs // 2))
-    return results + measure_skies(ground, max(1, runs // 5))
+    results += measure_skies(ground, max(1, runs // 5))
+    for azimuth, elevation in SUNS:
+        results += measure_bounces(ground, SunPosition(azimuth, elevation), max(1, runs // 5))
+    return results
 
 
 def measure_shadows(ground: Ground, sun: SunPosition, runs: int) -> list[LightResult]:
@@ -92,6 +109,8 @@ def measure_shadows(ground: Ground, sun: SunPosition, runs: int) -> list[LightRe
     heights, cell = ground.heights_m, ground.cell_m
     work: dict[str, Work] = {_lines(lines): partial(cast_shadow, heights, cell, sun, lines=lines) for lines in LINES}
     work["certified"] = partial(certified_shadow, heights, cell, sun)
+    shipped = ShippedLight(ground)
+    work |= {"clipmap light --hard": partial(shipped.hard, sun, 1), "clipmap light --certified": partial(shipped.hard, sun, None)}
     slow: dict[str, Work] = {
         "march, nearest sample": partial(walked_lit, ground, sun, nearest=True),
         "march, interpolated": partial(walked_lit, ground, sun),
@@ -142,6 +161,7 @@ def measure_discs(ground: Ground, sun: SunPosition, runs: int) -> list[LightResu
     work = {"1 hard shadow": partial(_hard_mean, ground, sun, 1)} | work
     for steps in STEPS:
         work[f"1 horizon, {steps} exact steps"] = partial(_one_horizon, ground, sun, steps)
+    work["clipmap light --soft"] = partial(ShippedLight(ground).soft, sun)
     work["3 horizons, 16 exact steps"] = partial(disc_by_chords, _swept(ground, 16), sun, 3)
     return _in_codes("disc", (sun.azimuth_deg, sun.elevation_deg), work, margins, expected, runs, ground)
 
@@ -171,7 +191,42 @@ def measure_skies(ground: Ground, runs: int) -> list[LightResult]:
         for steps in SKY_STEPS
         for count in AZIMUTHS
     }
+    shipped = ShippedLight(ground)
+    work |= {f"clipmap light --sky {count}": partial(shipped.sky, count) for count in AZIMUTHS}
     return _in_codes("sky", (None, None), work, margins, expected, runs, ground)
+
+
+def measure_bounces(ground: Ground, sun: SunPosition, runs: int) -> list[LightResult]:
+    """Return the results of nothing, means of all or of near ground, and of rays; errors in 8-bit codes of light.
+
+    All are given the direct light of all ground; their time is what then has to be added, the horizons of ``BOUNCE_AZIMUTHS`` included.
+    """
+    margins, shipped = ground.margins(SKY_SIDE), ShippedLight(ground)
+    codes = certified_shadow(ground.heights_m, ground.cell_m, sun)
+    light = direct_light(ground, sun, codes, shipped.sky(AZIMUTHS[-1]), SHARE)
+    unit = ALBEDO / (1 + SHARE)
+    expected = unit * gathered_light(ground, light, margins, REFERENCE_AZIMUTHS)
+
+    def filled(bounced: Callable[[], Array | float]) -> Array:
+        ground_share: Array = 1.0 - shipped.sky(BOUNCE_AZIMUTHS).astype(np.float64)
+        return unit * ground_share * bounced()
+
+    work: dict[str, Work] = {
+        "none": lambda: np.zeros(light.shape),
+        "clipmap light --bounce": lambda: filled(lambda: round(float(light.mean()) * _MEAN_STEPS) / _MEAN_STEPS),
+    }
+    for radius in RADII:
+        work[f"mean within {radius}"] = partial(filled, partial(local_mean, light, radius))
+    rays: dict[str, Work] = {
+        f"{count} azimuths of rays": partial(lambda count: unit * gathered_light(ground, light, margins, count), count)
+        for count in GATHERED
+    }
+    times, found = _timed(work, runs, rays)
+    scale = light.size / expected.size
+    times |= {name: [scale * seconds for seconds in times[name]] for name in rays}
+    cropped: dict[str, Array] = {name: share if name in rays else inner(share, margins).astype(np.float64) for name, share in found.items()}
+    place = (sun.azimuth_deg, sun.elevation_deg)
+    return [_compared("bounce", name, place, "codes", _CODES * share, _CODES * expected, times, ground) for name, share in cropped.items()]
 
 
 def _in_codes(

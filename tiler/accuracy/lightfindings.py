@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from tiler.accuracy.lightexperiments import AZIMUTHS, LINES, STEPS, SUNS, LightResult
+from tiler.accuracy.lightexperiments import AZIMUTHS, GATHERED, LINES, RADII, STEPS, SUNS, LightResult
 
 
 def light_findings(results: Sequence[LightResult]) -> list[str]:
@@ -10,7 +10,8 @@ def light_findings(results: Sequence[LightResult]) -> list[str]:
     by_name = {(one.place, one.method): one for one in results}
     sentences = [_shadows(by_name, azimuth, elevation) for azimuth, elevation in SUNS]
     sentences += [_horizons(by_name), _disc(by_name)]
-    return [*sentences, _sky(by_name, 0), _sky(by_name, 16)]
+    sentences += [_sky(by_name, 0), _sky(by_name, 16)]
+    return [*sentences, *(_bounce(by_name, azimuth, elevation) for azimuth, elevation in SUNS)]
 
 
 def brief(value: float) -> str:
@@ -54,10 +55,12 @@ def _disc(found: _Found) -> str:
     place = ("disc", *SUNS[1])
     hard, sweeps = found[place, "1 hard shadow"], found[place, "16 hard shadows"]
     least, most = found[place, "1 horizon, 16 exact steps"], found[place, "1 horizon, 32 exact steps"]
+    shipped = found[place, "clipmap light --soft"]
     return (
         f"The sun's disc at {SUNS[1][1]:g} degrees: a hard shadow is {brief(hard.error)} codes off (rms), 16 of them over the disc "
         f"{brief(sweeps.error)} codes in {brief(sweeps.ns_per_sample)} ns; one horizon with 16 exact steps {brief(least.error)} codes in "
-        f"{brief(least.ns_per_sample)} ns, with 32 {brief(most.error)} codes in {brief(most.ns_per_sample)} ns."
+        f"{brief(least.ns_per_sample)} ns, with 32 {brief(most.error)} codes in {brief(most.ns_per_sample)} ns; clipmap light --soft "
+        f"{brief(shipped.error)} codes in {brief(shipped.ns_per_sample)} ns."
     )
 
 
@@ -66,3 +69,21 @@ def _sky(found: _Found, steps: int) -> str:
     listed = [found[place, f"{count} azimuths, {steps} exact steps"] for count in AZIMUTHS]
     figures = ", ".join(f"{count} azimuths {brief(one.error)}" for count, one in zip(AZIMUTHS, listed, strict=True))
     return f"The sky with {steps} exact steps, codes rms: {figures}; {brief(listed[0].ns_per_sample / AZIMUTHS[0])} ns per azimuth."
+
+
+def _bounce(found: _Found, azimuth: float, elevation: float) -> str:
+    place = ("bounce", azimuth, elevation)
+    none, mean, rays = found[place, "none"], found[place, "clipmap light --bounce"], found[place, f"{GATHERED[-1]} azimuths of rays"]
+    near = {radius: found[place, f"mean within {radius}"] for radius in RADII}
+    best = min(RADII, key=lambda radius: near[radius].error)
+    near_by = near[best]
+    return (
+        f"Light thrown back, sun at {elevation:g} degrees: without it {brief(none.error)} codes are missing (rms; {_most(none)} at most); "
+        f"the mean of the map is {brief(mean.error)} codes off ({_most(mean)} at most), the mean within {best} samples, the best of its "
+        f"kind, {brief(near_by.error)} ({_most(near_by)}); {GATHERED[-1]} azimuths of rays {brief(rays.error)} codes in "
+        f"{_ratio(rays.ns_per_sample, mean.ns_per_sample)} times the time."
+    )
+
+
+def _most(one: LightResult) -> str:
+    return brief(one.largest or 0.0)

@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.scene import SUN_RADIUS_DEG
 from tiler.compiled import compiled
-from tiler.light.disc import SUN_RADIUS_DEG
 from tiler.light.frame import SunPosition, sine_cosine_deg
 
 Array = NDArray[np.float64]

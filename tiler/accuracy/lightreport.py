@@ -8,9 +8,12 @@ from typing import Any, Final
 import numpy as np
 
 from tiler.accuracy.lightexperiments import (
+    ALBEDO,
+    BOUNCE_AZIMUTHS,
     DISC_SIDE,
     REFERENCE_AZIMUTHS,
     REFERENCE_CHORDS,
+    SHARE,
     SKY_SIDE,
     SUNS,
     LightResult,
@@ -23,14 +26,24 @@ from tiler.accuracy.lightprecision import LightRung, measure_light_precision
 from tiler.accuracy.page import table
 
 PLOT: Final = "light.svg"
-_NAMES: Final = {"shadow": "Hard shadows", "horizon": "Horizons", "disc": "The sun's disc", "sky": "The light of the sky"}
+_NAMES: Final = {
+    "shadow": "Hard shadows",
+    "horizon": "Horizons",
+    "disc": "The sun's disc",
+    "sky": "The light of the sky",
+    "bounce": "Light that the ground throws back",
+}
 METHOD: Final = (
     "Truth is a walk in float64 along every ray: up to the edge, or to where even the highest sample could change nothing. Between the two "
     f"samples beside a ray the ground is a straight line. The disc is compared with {REFERENCE_CHORDS} upright chords, each with a walked "
     f"horizon, on the middle {DISC_SIDE} x {DISC_SIDE} samples; the sky with {REFERENCE_AZIMUTHS} azimuths, on the middle {SKY_SIDE} x "
     f"{SKY_SIDE}; shadows and horizons on all samples but 16 at each border. Codes are those of 8 bits: 255 is the whole sun, or sky. "
     "Times are processor times on one thread for all of the ground, turning it included: the least of all runs; walks are timed once. "
-    "The interpolated walk is its own truth, so its error is 0 by definition. Light that the ground throws back is not measured here."
+    "The interpolated walk is its own truth, so its error is 0 by definition. "
+    f"Light that the ground throws back is gathered from {REFERENCE_AZIMUTHS} azimuths of walked rays, from every sample of the ground "
+    f"that is seen, by the cosine law, on the middle {SKY_SIDE} x {SKY_SIDE}; ground beyond the edge is as bright as the mean. Codes are "
+    f"those of light as it is stored, with a sky of {SHARE:g} and an albedo of {ALBEDO:g}. Times there are what is added to direct light, "
+    f"the horizons of {BOUNCE_AZIMUTHS} azimuths included where they are needed; rays are timed on the samples that are compared."
 )
 
 
@@ -67,7 +80,7 @@ class LightReport:
 
 def measure_light(ground: Ground, runs: int, on_stage: Callable[[str], None] = lambda stage: None) -> LightReport:
     """Run all experiments on light; ``on_stage`` is told what comes next."""
-    on_stage("light: shadows, horizons, the sun's disc, the sky")
+    on_stage("light: shadows, horizons, the sun's disc, the sky, light thrown back")
     results = measure_lights(ground, runs)
     on_stage("light: precision")
     return LightReport(ground, tuple(results), tuple(measure_light_precision(ground, SUNS)))

@@ -23,8 +23,8 @@ _SLACK_M: Final = 1e-6
 
 
 @compiled
-def _met(rows: Array, row: int, place: float, nearest: bool) -> float:
-    """Return the height at a place on a row, NaN where one of the samples beside it is missing."""
+def met(rows: Array, row: int, place: float, nearest: bool) -> float:
+    """Return the value at a place on a row, NaN where one of the samples beside it is missing."""
     if nearest:
         column = math.floor(place + 0.5)
         return float(rows[row, column]) if 0 <= column < rows.shape[1] else math.nan
@@ -45,10 +45,10 @@ def _walk_to_sun(rows: Array, shift: float, drop: float, top: float, nearest: bo
             height = rows[row, column]
             seen = True
             for k in range(1, row + 1):
-                met = _met(rows, row - k, column + shift * k, nearest)
-                if math.isnan(met) or height + k * drop > top:
+                there = met(rows, row - k, column + shift * k, nearest)
+                if math.isnan(there) or height + k * drop > top:
                     break
-                if met - k * drop > height:
+                if there - k * drop > height:
                     seen = False
                     break
             lit[i, j] = seen
@@ -65,14 +65,15 @@ def _walk_to_horizon(
             height = rows[row, column]
             best = floor
             for k in range(1, row + 1):
-                met = _met(rows, row - k, column + shift * k, nearest)
-                if math.isnan(met) or (best > 0 and top - height < best * k * step):
+                there = met(rows, row - k, column + shift * k, nearest)
+                if math.isnan(there) or (best > 0 and top - height < best * k * step):
                     break
-                best = max(best, (met - height) / (k * step))
+                best = max(best, (there - height) / (k * step))
             tangents[i, j] = best
 
 
-def _margins_of_frame(turns: int, margins: Margins) -> Margins:
+def left_out_of_frame(turns: int, margins: Margins) -> Margins:
+    """Return the margins of a frame that is turned by so many quarters."""
     return margins if turns % 2 == 0 else (margins[1], margins[0])
 
 
@@ -80,7 +81,7 @@ def walked_lit(ground: Ground, sun: SunPosition, margins: Margins = (0, 0), *, n
     """Return whether the sun, above the horizontal, is seen from each sample within the margins (h, w)."""
     frame = frame_of((ground.heights_m.shape[0], ground.heights_m.shape[1]), ground.cell_m, sun.azimuth_deg)
     rows = np.ascontiguousarray(np.rot90(ground.heights_m, frame.turns), np.float64)
-    left_out = _margins_of_frame(frame.turns, margins)
+    left_out = left_out_of_frame(frame.turns, margins)
     lit = np.empty((rows.shape[0] - 2 * left_out[0], rows.shape[1] - 2 * left_out[1]), np.bool_)
     drop = frame.step_m * tangent_deg(sun.elevation_deg)
     _walk_to_sun(rows, frame.shift, drop, float(rows.max()) + _SLACK_M, nearest, left_out, lit)
@@ -96,7 +97,7 @@ def walked_horizons(
     """
     frame = frame_of((ground.heights_m.shape[0], ground.heights_m.shape[1]), ground.cell_m, azimuth_deg)
     rows = np.ascontiguousarray(np.rot90(ground.heights_m, frame.turns), np.float64)
-    left_out = _margins_of_frame(frame.turns, margins)
+    left_out = left_out_of_frame(frame.turns, margins)
     tangents = np.empty((rows.shape[0] - 2 * left_out[0], rows.shape[1] - 2 * left_out[1]))
     _walk_to_horizon(rows, frame.shift, frame.step_m, float(rows.max()) + _SLACK_M, floor, nearest, left_out, tangents)
     return np.rot90(tangents, -frame.turns)

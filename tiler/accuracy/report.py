@@ -12,6 +12,16 @@ from schemas.errors import MissingExtraError, StorageError, UsageError
 from tiler.accuracy import plots
 from tiler.accuracy.experiments import Candidate, measure_candidates
 from tiler.accuracy.findings import default_of, dominating, findings, frontier
+from tiler.accuracy.light_planner import (
+    PLANNER_PLOT,
+    PlannerResult,
+    measure_planner,
+    planner_findings,
+    planner_plot,
+    planner_rows,
+    planner_scenes,
+    planner_section,
+)
 from tiler.accuracy.lightground import Ground
 from tiler.accuracy.lightplots import light_pareto
 from tiler.accuracy.lightreport import PLOT, LightReport, light_section, measure_light
@@ -37,11 +47,17 @@ class Report:
     precision: tuple[Rung, ...]
     voids: tuple[VoidResult, ...]
     light: LightReport | None = None
+    planner: tuple[PlannerResult, ...] = ()
 
     @property
     def findings(self) -> list[str]:
         """What the figures mean, one sentence each."""
         return findings(self.sample, self.candidates, self.voids)
+
+    @property
+    def light_findings(self) -> list[str]:
+        """What the figures of light mean, one sentence each; none if light was not measured."""
+        return [] if self.light is None else [*self.light.findings, *planner_findings(self.planner)]
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything as plain values, ready for JSON."""
@@ -69,7 +85,7 @@ class Report:
             "candidates": [asdict(candidate) for candidate in self.candidates],
             "precision": [asdict(rung) for rung in self.precision],
             "voids": [asdict(result) for result in self.voids],
-        } | ({} if self.light is None else {"light": self.light.as_dict()})
+        } | ({} if self.light is None else {"light": self.light.as_dict(), "planner": planner_rows(self.planner)})
 
 
 def measure(sample: Sample, runs: int, on_stage: Callable[[str], None] = lambda stage: None, ground: Ground | None = None) -> Report:
@@ -81,7 +97,8 @@ def measure(sample: Sample, runs: int, on_stage: Callable[[str], None] = lambda 
     on_stage("voids")
     voids = measure_voids(sample)
     light = None if ground is None else measure_light(ground, runs, on_stage)
-    return Report(sample, runs, describe_machine(), tuple(candidates), tuple(precision), tuple(voids), light)
+    planner = [] if ground is None else measure_planner(planner_scenes(sample, ground), runs, on_stage)
+    return Report(sample, runs, describe_machine(), tuple(candidates), tuple(precision), tuple(voids), light, tuple(planner))
 
 
 def prepare_folder(folder: Path) -> None:
@@ -131,6 +148,10 @@ def write_report(report: Report, folder: Path) -> Path:
             _write_csv(folder / "light.csv", content["light"]["results"])
             light_pareto(report.sample.name, report.light.results, folder / PLOT)
             section = light_section(content["light"])
+        if report.planner:
+            _write_csv(folder / "planner.csv", content["planner"])
+            planner_plot(report.planner, folder / PLANNER_PLOT)
+            section += planner_section(report.planner)
         index.write_text(page(content, section), encoding="utf-8")
     except OSError as error:
         raise StorageError(f"{folder}: the report cannot be written: {error.strerror or error}") from error

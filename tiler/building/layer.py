@@ -15,6 +15,7 @@ from tiler.building.intent import Intent
 from tiler.building.plan import Plan
 from tiler.building.publish import Published, publish_layer, publish_update
 from tiler.cluster.job import Job, make_target
+from tiler.cluster.samplecopy import SampleCopy, delete_copy
 from tiler.stores import Claim, Store
 from tiler.stores.dataset import Dataset
 from tiler.tasks.cut import StageTimes
@@ -36,6 +37,8 @@ class LayerBuild:
 
     Afterwards ``manifest`` is the published one, ``changed`` says whether it is new, ``kept`` of the plan's tasks were found
     finished, and ``written`` is how many blocks were stored.
+
+    ``samples`` is the copy of the plan's samples that tasks in other processes read, made here unless it is there; None if they need none.
     """
 
     def __init__(
@@ -49,11 +52,12 @@ class LayerBuild:
         stamps: SourceStamps,
         settings: BuildSettings,
         engine: Engine,
+        samples: SampleCopy | None = None,
     ) -> None:
         # The records of another partition would be of no use, and blocks do not depend on it.
         self.plan = plan if intent.record is None else replace(plan, partition=intent.record.partition)
         self._intent, self._sources, self._store, self._claim = intent, sources, store, claim
-        self._dataset, self._stamps, self._settings, self._engine = dataset, stamps, settings, engine
+        self._dataset, self._stamps, self._settings, self._engine, self._copy = dataset, stamps, settings, engine, samples
         self._book = RecordBook(store, intent.tasks_path)
         self._is_update = intent.act == "update"
         self._is_continued = intent.path in claim.abandoned
@@ -102,6 +106,8 @@ class LayerBuild:
         plan, intent = self.plan, self._intent
         record = self._plan_record()
         RecordBook(self._store, intent.path).write_plan(record)
+        if self._copy is not None and not self._copy.holds(plan.source):
+            self._copy.make(plan.source)
         ledger = Ledger(plan.lattice, plan.source.conversion.channels)
         published = Dataset(self._store, self._dataset) if self._is_update and self._dataset is not None else None
         target = make_target(plan, self._store, intent.path, published)
@@ -117,6 +123,9 @@ class LayerBuild:
                     if done.record.piece is not None:
                         handed_on[done.task] = done.record.piece
             pieces = handed_on
+        if plan.light is not None or plan.normals is not None:
+            # Before the layer is published: until then everything under the path is this build's, however it ends.
+            delete_copy(self._store, intent.path)
         self._stamps.require_unchanged()
         self._claim.confirm()
         if published is None:
@@ -153,6 +162,7 @@ class LayerBuild:
             tasks_path=self._intent.tasks_path,
             update=self._is_update,
             version=None if self._dataset is None else self._dataset.version,
+            copied=self._copy is not None,
         )
 
     def _plan_record(self) -> PlanRecord:
@@ -165,6 +175,7 @@ class LayerBuild:
             stamps=self._stamps.stamps,
             ranges=list(self.plan.source.conversion.stretch or ()),
             light=self.plan.light_settings,
+            normals=self.plan.normal_settings,
             settings=self._settings.model_copy(update={"overwrite": False, "update": False, "break_lock": False}),
         )
 

@@ -1,5 +1,6 @@
 """Building a layer of light: the heights of a dataset, one sun, and the same tasks, records and manifest as any other layer."""
 
+import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,34 +11,39 @@ from typing import Final
 from schemas.address import LAYER_NAME
 from schemas.errors import NotFoundError, UsageError
 from schemas.lattice import Lattice
-from schemas.manifest import Layer, Light, Manifest, SampleType, digest
+from schemas.light import Light
+from schemas.manifest import Layer, Manifest, SampleType, digest
 from schemas.region import Rect
 from schemas.settings import BuildSettings, LightSettings
 from tiler.building.build import BuildReport, report_of, up_to_date
-from tiler.building.intent import decide
+from tiler.building.intent import Intent, decide
 from tiler.building.layer import LayerBuild, Progress
 from tiler.building.leftovers import sweep
 from tiler.building.placement import Placement
 from tiler.building.plan import Plan
 from tiler.checking.blockreader import BlockReader
+from tiler.cluster.samplecopy import SampleCopy
 from tiler.codecs import BlockFormat, open_codec
 from tiler.filters.cascade import Recipe
 from tiler.filters.kernels import DESIGNS
 from tiler.light.frame import MEAN_RADIUS_M
+from tiler.light.heights import refined_layer
 from tiler.light.lightsource import LightSource, Simulation
 from tiler.light.place import GridPlace, place_of
 from tiler.light.sunposition import refracted_deg, sun_position
+from tiler.stores import Store
 from tiler.stores.dataset import Dataset, read_manifest
 from tiler.stores.locate import open_store
-from tiler.tasks.engine import LocalEngine
+from tiler.tasks.engine import Engine, LocalEngine
 from tiler.tasks.partition import choose_task_side
 from tiler.tasks.records import Partition
 from tiler.tasks.stamps import SourceStamps
 
 _RADIUS: Final = 3
-_REFRACTION: Final = 0.13
+REFRACTION: Final = 0.13
+"""Curvature of a level ray relative to that of the Earth, where rays are bent at all."""
 _BOUNCE_AZIMUTHS: Final = 16
-_CODECS: Final = ("png", "jpeg", "raw", "exr")
+_CODECS: Final = ("png", "jpeg", "webp", "raw", "exr")
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,11 +79,15 @@ def build_light(
     settings: LightSettings,
     on_progress: Progress = lambda done, total: None,
     on_stage: Callable[[str], None] = lambda name: None,
+    engine: Engine | None = None,
+    choose: Callable[[Dataset, LightSettings], LightSettings] = lambda dataset, settings: settings,
 ) -> LightReport:
     """Build the layer of light that ``settings`` describe from the heights of the dataset at ``output``, and publish it.
 
-    Resumes and updates as ``build_layer`` does. Raises NotFoundError without the dataset or its heights, UsageError, InputError or
-    StorageError, and MissingExtraError if a time is given and PyEphem is missing.
+    Resumes and updates as ``build_layer`` does. Sun and sky are found by this process in any case; with an ``engine`` whose tasks run in
+    others, the light is copied into the store for them, as long as the build lasts. ``choose`` may change what is simulated, once nobody
+    else can change the heights. Raises NotFoundError without the dataset or its heights, UsageError, InputError or StorageError, and
+    MissingExtraError if a time is given and PyEphem is missing.
     """
     started = perf_counter()
     store = open_store(output)
@@ -87,21 +97,33 @@ def build_light(
             raise NotFoundError(f"{store.location}: no dataset there; build one with heights first: clipmap build DEM -o {output}")
         dataset = Dataset(store, manifest)
         sweep(dataset, claim)
+        settings = choose(dataset, settings)
         plan, source, stamps = open_light(dataset, settings)
         try:
             light = source.simulation.light
-            build_settings = _build_settings(settings)
-            intent = decide(store, claim, manifest, plan, stamps, build_settings)
+            common = build_settings(settings)
+            intent = decide(store, claim, manifest, plan, stamps, common)
             if intent.act is None:
                 report = up_to_date(store, claim, manifest, plan, intent, settings.records, started)
                 return LightReport(report, light, {})
-            source.bake(on_stage)
-            build = LayerBuild(plan, intent, [], store, claim, manifest, stamps, build_settings, LocalEngine(plan.workers))
-            on_stage("blocks")
+            copy = copy_for(engine, store, intent, plan, stamps)
+            if copy is None or not copy.holds(source):
+                source.bake(on_stage)
+            build = LayerBuild(plan, intent, [], store, claim, manifest, stamps, common, engine or LocalEngine(plan.workers), copy)
+            on_stage("blocks" if copy is None else "copy and blocks")
             build.run(on_progress)
+            if copy is not None:
+                source.stages_s["copy"] = copy.seconds
         finally:
             source.close()
         return LightReport(report_of(build, intent, claim, perf_counter() - started), light, source.stages_s)
+
+
+def copy_for(engine: Engine | None, store: Store, intent: Intent, plan: Plan, stamps: SourceStamps) -> SampleCopy | None:
+    """Return the copy of the samples that an engine needs whose tasks run in other processes; None if they run in this one."""
+    if engine is None or isinstance(engine, LocalEngine):
+        return None
+    return SampleCopy(store, intent.path, "\n".join([plan.digest, json.dumps(plan.place), *stamps.stamps]), plan.workers)
 
 
 def open_light(dataset: Dataset, settings: LightSettings) -> tuple[Plan, LightSource, HeightStamps]:
@@ -117,13 +139,14 @@ def simulate(layer: Layer, manifest: Manifest, settings: LightSettings, where: s
     """Return what is simulated over the heights of ``layer``, its sun found if only a time is given."""
     if layer.kind != "height":
         raise UsageError(f"{where}: is of kind {layer.kind}; light falls on heights, name their layer with --from")
-    place = place_of(layer, manifest.world, where)
+    place = place_of(refined_layer(layer, settings.density), manifest.world, where)
     azimuth, elevation = _sun_of(settings, place, where)
     if settings.refraction:
         elevation = refracted_deg(elevation)
     return Simulation(
         Light(
             height=settings.height,
+            density=settings.density,
             azimuth_deg=azimuth % 360.0 % 360.0,
             elevation_deg=elevation,
             grid_azimuth_deg=place.on_grid(azimuth, elevation).azimuth_deg,
@@ -132,11 +155,12 @@ def simulate(layer: Layer, manifest: Manifest, settings: LightSettings, where: s
             lines=settings.lines if settings.shadows == "hard" else None,
             radius_deg=settings.radius_deg if settings.shadows == "soft" else None,
             sky_azimuths=settings.sky or (_BOUNCE_AZIMUTHS if settings.bounce else 0),
-            sky_share=settings.share if settings.sky else 0.0,
+            sky_share=settings.share if settings.sky or settings.open_sky else 0.0,
             albedo=settings.albedo if settings.bounce else 0.0,
             radius_m=MEAN_RADIUS_M if settings.curvature else None,
-            refraction=_REFRACTION if settings.refraction else 0.0,
+            refraction=REFRACTION if settings.refraction else 0.0,
             voids=layer.width * layer.height - layer.statistics.valid,
+            left_out=list(settings.left_out),
         ),
         place,
     )
@@ -156,7 +180,8 @@ def _dtype(settings: LightSettings) -> SampleType:
     return "uint16" if settings.bits == 16 else "uint8"
 
 
-def _build_settings(settings: LightSettings) -> BuildSettings:
+def build_settings(settings: LightSettings) -> BuildSettings:
+    """Return what the settings of light say of any build."""
     return BuildSettings(
         codec=settings.codec,
         task=settings.task,
@@ -177,17 +202,18 @@ def plan_light(source: LightSource, light: Light, manifest: Manifest, settings: 
         raise UsageError(f"--layer {name}: {reason}; choose another name")
     if settings.codec.partition(":")[0] not in _CODECS:
         raise UsageError(f"--codec {settings.codec}: light is stored as {', '.join(_CODECS)}")
-    heights = manifest.layer(light.height)
+    heights = refined_layer(manifest.layer(light.height), light.density)
     lattice = Lattice(heights.width, heights.height, settings.block or heights.block, "point")
     dtype = source.conversion.dtype
     alpha = source.masked and dtype != "float32"
     # Light in floats has its voids in a mask, as heights have.
-    block = BlockFormat("height" if dtype == "float32" else "light", lattice.stored_side, 1 + alpha, dtype, alpha)
+    block = BlockFormat("light", lattice.stored_side, 1 + alpha, dtype, alpha)
     return Plan(
         source=source,
         name=name,
         lattice=lattice,
-        recipe=Recipe(DESIGNS["blackman-sinc"](_RADIUS, "point"), "mirror", source.masked, False),
+        # A shadow beside the edge must not be continued as the opposite of itself.
+        recipe=Recipe(DESIGNS["blackman-sinc"](_RADIUS, "point"), "mirror-sample", source.masked, False),
         block=block,
         codec=open_codec(settings.codec, block),
         placement=Placement(manifest.world, heights.transform, heights.source.placement, heights.ground_spacing_m),

@@ -13,9 +13,10 @@ from pydantic import JsonValue
 
 from schemas.errors import UsageError
 from schemas.lattice import Lattice, Registration
-from schemas.manifest import LayerKind, Light, Manifest, digest
+from schemas.light import Light, Normals
+from schemas.manifest import LayerKind, Manifest, digest
 from schemas.region import Rect
-from schemas.settings import BuildSettings, LightSettings
+from schemas.settings import BuildSettings, LightSettings, NormalSettings
 from tiler.building.placement import Placement, place
 from tiler.codecs import BlockFormat, Codec, open_codec
 from tiler.filters.cascade import Recipe
@@ -41,8 +42,6 @@ class _Defaults:
 _DEFAULTS: Final[dict[LayerKind, _Defaults]] = {
     "height": _Defaults("point", "antisymmetric", 6),
     "imagery": _Defaults("area", "mirror", 3),
-    # A shadow beside the edge must not be continued as the opposite of itself.
-    "light": _Defaults("point", "mirror", 3),
 }
 
 
@@ -64,6 +63,8 @@ class Plan:
     enhance: str | None
     light: Light | None = None
     light_settings: LightSettings | None = None
+    normals: Normals | None = None
+    normal_settings: NormalSettings | None = None
 
     @cached_property
     def tiers(self) -> tuple[Tier, ...]:
@@ -96,7 +97,8 @@ class Plan:
             "linear-light": self.linear_light,
             "fill": self.fill,
             "enhance": self.enhance,
-            **({} if self.light is None else {"light": self.light.model_dump(mode="json", exclude={"voids"})}),
+            **({} if self.light is None else {"light": self.light.model_dump(mode="json", exclude={"voids", "left_out"})}),
+            **({} if self.normals is None else {"normals": self.normals.model_dump(mode="json", exclude={"voids"})}),
             **{name: version(name) for name in self.libraries},
         }
 

@@ -191,6 +191,7 @@ def _layer_entry(plan: Plan, path: str, patches: list[Patch], ledger: Ledger) ->
         fill=plan.fill,
         enhance=plan.enhance,
         light=plan.light,
+        normals=plan.normals,
         statistics=ledger.statistics(),
         levels=[ledger.level(level) for level in range(plan.lattice.levels)],
     )

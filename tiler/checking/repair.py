@@ -12,7 +12,7 @@ from schemas.address import BlockAddress
 from schemas.errors import ClipmapError, InputError, NotFoundError, StorageError
 from schemas.findings import Finding, VerifyReport
 from schemas.manifest import digest
-from schemas.settings import LightSettings
+from schemas.settings import LightSettings, NormalSettings
 from tiler.building.plan import Plan, plan_layer
 from tiler.checking.verify import Checks, verify
 from tiler.samples.opening import open_samples
@@ -103,11 +103,13 @@ class _Repair:
         if record is None:
             raise InputError("there are no records of how the layer was built; rebuild it (clipmap build --overwrite)")
         self._source: SampleSource
-        if record.light is None:
+        if record.light is not None:
+            plan, self._source, self._stamps = _lit_again(dataset, record.light, workers)
+        elif record.normals is not None:
+            plan, self._source, self._stamps = _found_again(dataset, record.normals, workers)
+        else:
             self._source = _reopened(dataset, record, workers)
             plan, self._stamps = plan_layer(self._source, dataset.manifest, record.settings), SourceStamps(self._source.info)
-        else:
-            plan, self._source, self._stamps = _lit_again(dataset, record.light, workers)
         self._plan = replace(plan, partition=record.partition)
         # Of other versions of libraries the same bytes are likely, and whether they are is checked block by block.
         if difference := record.explain(self._plan.signature, ignored=self._plan.libraries):
@@ -187,6 +189,19 @@ def _lit_again(dataset: Dataset, settings: LightSettings, workers: int) -> tuple
     from tiler.building.light import open_light  # noqa: PLC0415 - a fifth of a second that other layers need not wait for
 
     plan, source, stamps = open_light(dataset, settings.model_copy(update={"workers": workers}))
+    try:
+        source.bake()
+    except BaseException:
+        source.close()
+        raise
+    return plan, source, stamps
+
+
+def _found_again(dataset: Dataset, settings: NormalSettings, workers: int) -> tuple[Plan, SampleSource, SourceStamps]:
+    """Return the plan of a layer of normals and the normals themselves, found anew on the dataset's heights."""
+    from tiler.building.normals import open_normals  # noqa: PLC0415 - as above
+
+    plan, source, stamps = open_normals(dataset, settings.model_copy(update={"workers": workers}))
     try:
         source.bake()
     except BaseException:

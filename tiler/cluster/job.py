@@ -13,8 +13,10 @@ from typing import Final
 from pydantic import Field, ValidationError
 
 from schemas.errors import InputError, NotFoundError, StorageError, UsageError
-from schemas.manifest import Model
+from schemas.manifest import Manifest
+from schemas.model import Model
 from tiler.building.plan import Plan, plan_layer
+from tiler.cluster.samplecopy import CopiedSamples
 from tiler.samples.opening import open_samples
 from tiler.sources.convert import SampleSource
 from tiler.stores import Store
@@ -48,6 +50,7 @@ class Job(Model):
     tasks_path: str = Field(description="Layer path under which the task records lie")
     update: bool = Field(description="Whether only blocks that differ from the published ones are stored")
     version: str | None = Field(description="Version of the dataset that is published while the build is at work; null if none is")
+    copied: bool = Field(description="Whether the samples are copied into the store, because no other process can make them")
 
     def post(self, store: Store) -> JobRef:
         """Put the job down where other processes look for it, in place of one that a killed build left; raises StorageError."""
@@ -81,7 +84,7 @@ def make_target(plan: Plan, store: Store, path: str, published: Dataset | None) 
 
 
 def open_job(ref: JobRef) -> OpenJob:
-    """Open the source files of a job and make its plan anew.
+    """Open the source files of a job, or the copy of its samples, and make its plan anew.
 
     Raises StorageError if the job is not there or the dataset is another one than the build sees, InputError if a source file is,
     UsageError if this process would make other blocks; and whatever opening sources and stores raises.
@@ -92,16 +95,48 @@ def open_job(ref: JobRef) -> OpenJob:
     if (None if dataset is None else dataset.version) != job.version:
         raise StorageError(f"{ref.location}: a worker sees another version of the dataset than the build does; let all share one store")
     record = job.record
-    source = open_samples([Path(path) for path in job.sources], store.scratch, record.settings, 1, lambda _: tuple(record.ranges) or None)
+    plan, stamps = _planned(store, dataset, job)
+    source = plan.source
     try:
-        stamps = SourceStamps(source.info)
-        plan = replace(plan_layer(source, dataset, record.settings), partition=record.partition)
         _check_same(record, stamps, plan)
         target = make_target(plan, store, job.path, Dataset(store, dataset) if dataset is not None and job.update else None)
         return OpenJob(TaskWorker(plan, target, RecordBook(store, job.tasks_path), stamps), source)
     except BaseException:
         source.close()
         raise
+
+
+def _planned(store: Store, dataset: Manifest | None, job: Job) -> tuple[Plan, SourceStamps]:
+    """Return the plan, its source open, and the state of the source; its tasks are those of the build."""
+    record = job.record
+    stamps: SourceStamps
+    source: SampleSource
+    if dataset is not None and (record.light is not None or record.normals is not None):
+        plan, stamps = _planned_from_heights(Dataset(store, dataset), record)
+        source = CopiedSamples(plan.source, store, job.path) if job.copied else plan.source
+        return replace(plan, source=source, partition=record.partition), stamps
+    source = open_samples([Path(path) for path in job.sources], store.scratch, record.settings, 1, lambda _: tuple(record.ranges) or None)
+    try:
+        stamps = SourceStamps(source.info)
+        return replace(plan_layer(source, dataset, record.settings), partition=record.partition), stamps
+    except BaseException:
+        source.close()
+        raise
+
+
+def _planned_from_heights(dataset: Dataset, record: PlanRecord) -> tuple[Plan, SourceStamps]:
+    """Return the plan of a layer of light or of normals, its source not yet baked, and the state of the heights."""
+    if record.normals is not None:
+        from tiler.building.normals import open_normals  # noqa: PLC0415 - it imports what puts jobs down
+
+        plan, _, stamps = open_normals(dataset, record.normals.model_copy(update={"workers": 1}))
+        return plan, stamps
+    from tiler.building.light import open_light  # noqa: PLC0415 - as above
+
+    if record.light is None:
+        raise ValueError("a layer that comes from files")
+    plan, _, stamps = open_light(dataset, record.light.model_copy(update={"workers": 1}))
+    return plan, stamps
 
 
 def _read(store: Store, ref: JobRef) -> Job:

@@ -14,13 +14,15 @@ from tiler.codecs import BlockFormat, Factory, Mask, Samples, checked, decoding,
 _HALF_MAX: Final = 65504.0
 _MAGIC: Final = b"\x76\x2f\x31\x01"
 _ZIP: Final = b"\x03"
+_CHANNELS: Final = {1: ("Y",), 2: ("N.X", "N.Y")}
+"""OpenEXR's name for brightness alone; the parts of a vector, as renderers name those of normals."""
 _ZIP_ROWS: Final = 16
 """Rows that are compressed together, a chunk of the file."""
 
 
 @dataclass(frozen=True, slots=True)
 class ExrCodec:
-    """A ZIP-compressed scan-line EXR with channel Y, and A (1 valid, 0 void) if the block has voids.
+    """A ZIP-compressed scan-line EXR with channel Y, or N.X and N.Y of normals, and A (1 valid, 0 void) if the block has voids.
 
     ``half`` keeps 11 significant bits: 0.25 m from 256 to 512 m, 4 m from 4096 to 8192 m. Prefer ``float`` for heights.
     """
@@ -45,14 +47,18 @@ class ExrCodec:
         """The finite range of half floats."""
         return (-_HALF_MAX, _HALF_MAX) if self.half else None
 
+    @property
+    def _names(self) -> tuple[str, ...]:
+        return _CHANNELS[self.block.channels]
+
     def encode(self, samples: Samples, mask: Mask | None) -> bytes:
-        """Return the EXR file of ``samples`` (side, side, 1) float32; raises InputError if half cannot hold a height."""
+        """Return the EXR file of ``samples`` (side, side, channels) float32; raises InputError if half cannot hold a height."""
         samples, mask = voids_zeroed(samples, mask)
         if self.half and np.abs(samples).max() > _HALF_MAX:
             raise InputError(f"codec exr:half holds values up to {_HALF_MAX:g} only; use exr:float")
         dtype = np.float16 if self.half else np.float32
         with np.errstate(under="ignore"):
-            channels = {"Y": np.ascontiguousarray(samples[..., 0], dtype)}
+            channels = {name: np.ascontiguousarray(samples[..., place], dtype) for place, name in enumerate(self._names)}
         if mask is not None:
             channels["A"] = mask.astype(dtype)
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
@@ -62,13 +68,12 @@ class ExrCodec:
         return buffer.getvalue()
 
     def decode(self, data: bytes) -> tuple[Samples, Mask | None]:
-        """Return (side, side, 1) float32 and mask; raises InputError if ``data`` is damaged."""
+        """Return (side, side, channels) float32 and mask; raises InputError if ``data`` is damaged."""
         with decoding(self.spec):
             _require_complete(data, self.block.side)
             with OpenEXR.File(io.BytesIO(data)) as file:
                 pixels = {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
-            planes = [pixels[name] for name in ("Y", "A") if name in pixels]
-            samples = checked(np.stack(planes, axis=-1)[..., :1], self.block, self.spec)
+            samples = checked(np.stack([pixels[name] for name in self._names], axis=-1), self.block, self.spec)
         return voids_zeroed(samples, pixels["A"] > 0.5 if "A" in pixels else None)
 
 
@@ -110,7 +115,7 @@ def _header(data: bytes) -> tuple[dict[bytes, bytes], int]:
 def _exr(block: BlockFormat, parameters: str) -> ExrCodec:
     if parameters not in ("", "half", "float"):
         raise UsageError(f"codec exr:{parameters}: use exr:half or exr:float")
-    if block.channels != 1 or block.dtype != "float32":
+    if block.channels != (2 if block.kind == "normal" else 1) or block.dtype != "float32":
         raise UsageError(f"codec exr holds heights, not {block}; use png")
     return ExrCodec(block, parameters == "half")
 

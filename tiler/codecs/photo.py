@@ -89,15 +89,35 @@ def _png(block: BlockFormat, parameters: str) -> PictureCodec:
 
 def _webp(block: BlockFormat, parameters: str) -> PictureCodec:
     quality = _quality(parameters, 85, "webp")
-    if block.kind == "height" or block.channels not in (3, 4) or block.dtype != "uint8":
-        raise UsageError(f"codec webp holds 8-bit imagery of 3 or 4 channels, not {block}; use png")
+    is_grey = block.kind == "light" and block.channels in (1, 2)
+    if block.kind in ("height", "normal") or not (is_grey or block.channels in (3, 4)) or block.dtype != "uint8":
+        raise UsageError(f"codec webp holds 8-bit imagery of 3 or 4 channels and 8-bit light, not {block}; use png")
+    return _grey_webp(block, quality) if is_grey else _coloured_webp(block, quality)
 
+
+def _coloured_webp(block: BlockFormat, quality: int) -> PictureCodec:
     def encode(samples: Samples) -> bytes:
         return bytes(imagecodecs.webp_encode(samples, level=quality, lossless=False))
 
     def decode(data: bytes, out: Samples) -> None:
         # libwebp drops an alpha channel that is opaque everywhere, and gives it back when asked for one.
         imagecodecs.webp_decode(data, hasalpha=block.channels == 4, out=out)
+
+    return PictureCodec(block, f"webp:{quality}", "webp", "image/webp", None, encode, decode)
+
+
+def _grey_webp(block: BlockFormat, quality: int) -> PictureCodec:
+    """Return the codec of one channel, and alpha: three equal ones, as WebP knows no grey; they come back equal to a code."""
+
+    def encode(samples: Samples) -> bytes:
+        grey, alpha = np.split(samples.reshape(*samples.shape[:2], block.channels), [1], axis=-1)
+        return bytes(imagecodecs.webp_encode(np.concatenate([grey, grey, grey, alpha], axis=-1), level=quality, lossless=False))
+
+    def decode(data: bytes, out: Samples) -> None:
+        colours = np.empty((block.side, block.side, 2 + block.channels), np.uint8)
+        imagecodecs.webp_decode(data, hasalpha=block.channels == 2, out=colours)
+        # Green, of which brightness has most, and alpha if there is one.
+        out[...] = colours[..., 1::2].reshape(out.shape)
 
     return PictureCodec(block, f"webp:{quality}", "webp", "image/webp", None, encode, decode)
 

@@ -10,28 +10,11 @@ import math
 from typing import Final
 
 FULL_SCALE: Final = 255.0
-SRGB_TOE: Final = 12.92
-"""Slope of the sRGB encoding at black (IEC 61966-2-1), its largest."""
 
 
 def code_scale(sky_share: float) -> float:
     """Return K, the codes of the sun on a surface that faces it: the most that one sample's direct light can be."""
     return FULL_SCALE / (1 + sky_share)
-
-
-def srgb_codes(linear_codes: float) -> float:
-    """Return what a difference of light [codes] becomes at most in sRGB codes: that of the same light next to black.
-
-    The encoding g is concave and g(0) = 0, so g(a) - g(b) <= g(a - b).
-    """
-    light = linear_codes / FULL_SCALE
-    return FULL_SCALE * (SRGB_TOE * light if light <= 0.0031308 else 1.055 * light ** (1 / 2.4) - 0.055)
-
-
-def linear_codes(srgb: float) -> float:
-    """Return the difference of light [codes] that can be at most ``srgb`` codes after encoding; inverse of ``srgb_codes``."""
-    code = srgb / FULL_SCALE
-    return FULL_SCALE * (code / SRGB_TOE if code <= 0.04045 else ((code + 0.055) / 1.055) ** 2.4)
 
 
 def least_facing(margin_deg: float) -> float:
@@ -179,7 +162,7 @@ def normal_map_codes(gradient_difference: float, sky_share: float) -> float:
 
     The unit normal of a slope differs by no more than the slope; n.s changes by no more than n, and the open sky's (1 + n_z) / 2 by half.
     """
-    return code_scale(sky_share) * min(2.0, gradient_difference) * (1 + sky_share / 2)
+    return min(FULL_SCALE, code_scale(sky_share) * gradient_difference * (1 + sky_share / 2))
 
 
 def gamma_filter_codes(local_range: float, norm: float) -> float:

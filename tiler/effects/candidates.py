@@ -30,13 +30,13 @@ class PyramidFacts:
     gradient_difference: float | None = None
     """Largest difference of slopes, as vectors, between level 0 and level 1 drawn as triangles."""
     local_range: float | None = None
-    """Largest range of sRGB values (0 to 1) of imagery under the taps of its filter."""
+    """At least the largest range of sRGB values (0 to 1) of imagery under the taps of its filter."""
     filter_norm: float = 1.52
     """Sum of absolute weights of that filter over both axes."""
     detail_sigma_m: float | None = None
-    """Standard deviation of level 0 about level 1 interpolated, from which synthetic detail starts [m]."""
+    """Standard deviation of level 0 about level 1 drawn as triangles, from which synthetic detail starts [m]."""
     hurst: float = 0.8
-    """By which that falls from level to level, as 2**-hurst."""
+    """By which that falls from level to level, as 2**-hurst: the Hurst exponent of the roughness, 0 to 1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,7 +125,7 @@ class _BakeBounds:
         self._elevation = scene.sun.direction_deg[1]
         disc = scene.sun.radius_deg
         # Somewhere on the map the sun stands lower than at its centre: every bound holds for that sun too.
-        self._turn_deg = bounds.sun_direction_deg(found.diagonal_m, scene.ground.radius_m)
+        self._turn_deg = max(bounds.sun_direction_deg(found.diagonal_m, scene.ground.radius_m), found.sun_turn_deg)
         self._lowest = max(-90.0, self._elevation - self._turn_deg - (disc if soft else 0.0))
         self.reach_m = bounds.reach_m(found.relief_m, self._lowest, found.diagonal_m)
         around = surroundings(found)
@@ -155,8 +155,13 @@ class _BakeBounds:
         found, scale = self._found, bounds.code_scale(self._share)
         statistic = f"slope toward the sun <= {found.toward:.4g}, tan(elevation) {math.tan(math.radians(self._elevation)):.4g}"
         disc = 0.0 if not self._scene.sun.radius_deg else np.where(self._disc, 0.0, scale / 2)
+        shadow, formula = np.where(self._point, 0.0, scale), "0 if n.s >= sin(turn) on every facet, else K"
+        if self._soft:
+            # Soft edges go with their shadow: where only the sun's centre is proved to be seen, up to half of the disc is hidden.
+            shadow = np.maximum(shadow, disc)
+            formula = "0 if n.s >= sin(disc + turn) on every facet, K / 2 if >= sin(turn), else K"
         return [
-            self._candidate("shadow", np.where(self._point, 0.0, scale), statistic, "0 if n.s >= sin(turn) on every facet, else K"),
+            self._candidate("shadow", shadow, statistic, formula),
             self._candidate("penumbra", disc, f"n.s >= {found.facing:.4g}", "0 if n.s >= sin(disc + turn) on every facet, else K / 2"),
         ]
 
@@ -203,7 +208,8 @@ class _BakeBounds:
         ]
         # A sun whose azimuth turns throws its shadows elsewhere, so a soft edge does not help.
         turned = bounds.turned_sun_codes(self._turn_deg, self._share)
-        statistic, formula = f"diagonal {found.diagonal_m:.4g} m", "diagonal / 2 R"
+        on_grid = f", on the grid {found.sun_turn_deg:.3g} degrees" if found.sun_turn_deg else ""
+        statistic, formula = f"diagonal {found.diagonal_m:.4g} m{on_grid}", "diagonal / 2 R, or more on the grid"
         if self.is_lit:
             return [*rows, self._candidate("sun_direction", turned, statistic, f"K {formula}")]
         return [*rows, self._angle("sun_direction", self._turn_deg, turned, statistic, formula)]
@@ -258,10 +264,12 @@ def _view_bounds(scene: Scene, found: HeightStatistics, facts: PyramidFacts) -> 
 
     jump = viewbounds.geomorph_px(facts.differences_m, min(found.cell_m), viewer.grid, focal, stretch) if facts.differences_m else None
     largest = max(facts.differences_m, default=0.0)
-    detail, sigma = None, facts.detail_sigma_m
+    detail, sigma, rough = None, facts.detail_sigma_m, "the roughness of the finest level is not known"
     if sigma is not None:
         amplitude = viewbounds.synthesis_amplitude_m(sigma, facts.hurst, viewer.detail_octaves, viewer.largest_deviate)
         detail = viewbounds.shift_px(amplitude, viewer.clearance_m, focal, stretch)
+        reaches = ", which it reaches" if detail == math.inf else ""
+        rough = f"sigma {sigma:.4g} m, H {facts.hurst:.2f}, {viewer.clearance_m:.4g} m away{reaches}"
     slopes, contrast = facts.gradient_difference, facts.local_range
     return [
         view(
@@ -282,7 +290,7 @@ def _view_bounds(scene: Scene, found: HeightStatistics, facts: PyramidFacts) -> 
             "synthesis",
             "pixels",
             detail,
-            "the roughness of the finest level is not known" if sigma is None else f"sigma {sigma:.4g} m, {viewer.clearance_m:.4g} m away",
+            rough,
             "f (1 + tan^2 corner) asin(amplitude / distance)",
         ),
         view(

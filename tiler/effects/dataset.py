@@ -22,9 +22,11 @@ from schemas.region import Rect
 from schemas.scene import Scene
 from tiler.checking.blockreader import BlockReader
 from tiler.effects.candidates import PyramidFacts
-from tiler.effects.levels import compare_levels
+from tiler.effects.imagery import ImageryMeter
+from tiler.effects.levels import LevelDifference, compare_levels
 from tiler.effects.plan import plan_effects
 from tiler.effects.statistics import HeightMeter, HeightStatistics
+from tiler.effects.turning import sun_turn_deg
 from tiler.light.place import GridPlace, place_of
 from tiler.light.sunposition import sun_position
 from tiler.stores.dataset import Dataset
@@ -42,14 +44,23 @@ _SAME: Final = 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedStatistics(HeightStatistics):
-    """Statistics of a map whose samples lie from ``cell_m`` to ``widest_m`` metres (along a row, along a column) apart."""
+    """Statistics of a map whose samples lie from ``cell_m`` to ``widest_m`` metres (along a row, along a column) apart.
+
+    On it the sun is turned by up to ``turned_deg`` from where it stands at the centre.
+    """
 
     widest_m: tuple[float, float]
+    turned_deg: float
 
     @property
     def diagonal_m(self) -> float:
         """At least the distance between opposite corners of the map [m]."""
         return math.hypot((self.width - 1) * self.widest_m[0], (self.height - 1) * self.widest_m[1])
+
+    @property
+    def sun_turn_deg(self) -> float:
+        """At least by how much the grid's directions turn the sun anywhere [degrees]."""
+        return self.turned_deg
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,9 +79,16 @@ class MeasuredMap:
 
 
 def measure_dataset(
-    dataset: Dataset, layer: str, scene: Scene, workers: int | None = None, on_progress: Progress = lambda done, total: None
+    dataset: Dataset,
+    layer: str,
+    scene: Scene,
+    workers: int | None = None,
+    on_progress: Progress = lambda done, total: None,
+    imagery: bool = False,
 ) -> MeasuredMap:
     """Return what is to be known of the heights of ``layer`` under ``scene``; ``on_progress`` is told of block rows.
+
+    With ``imagery`` all imagery of the dataset is measured as well, on which the bound of filtering rests.
 
     Raises NotFoundError if the layer or a block is missing, UsageError if it has no heights or lies nowhere, InputError if a block is
     damaged or all is void, MissingExtraError if the sun is given as a time and PyEphem is missing.
@@ -83,8 +101,15 @@ def measure_dataset(
     scene = with_known_sun(scene, place, where)
     azimuth, elevation = scene.sun.direction_deg
     scene = scene.with_sun(place.on_grid(azimuth, elevation).azimuth_deg, elevation)
+    meter = ImageryMeter(dataset) if imagery else None
+    more = 0 if meter is None else meter.rows
     with ThreadPoolExecutor(workers or len(os.sched_getaffinity(0))) as pool:
-        found, facts = _Pass(reader, place, scene, pool).run(on_progress)
+        found, facts = _Pass(reader, place, scene, pool).run(lambda done, total: on_progress(done, total + more))
+        if meter is not None and more:
+            known = sum(-(-level.height // reader.lattice.block) for level in reader.layer.levels)
+            contrast = meter.measure(pool, lambda done, total: on_progress(known + done, known + total))
+            facts = replace(facts, local_range=contrast.local_range, filter_norm=contrast.filter_norm)
+    found = replace(found, turned_deg=sun_turn_deg(place, azimuth, elevation))
     return MeasuredMap(scene, azimuth, place, found, facts)
 
 
@@ -138,9 +163,9 @@ class _Pass:
         # in a corner of the box, as they are convex.
         self._meters = [HeightMeter(shape, cell, scene.sun.direction_deg) for cell in _corners(*self._cells)]
         self._kept: list[dict[int, Float32]] = [{} for _ in layer.levels]
-        self._differences: list[list[tuple[float, float]]] = [[] for _ in layer.levels[1:]]
+        self._differences: list[list[LevelDifference]] = [[] for _ in layer.levels[1:]]
 
-    def run(self, on_progress: Progress) -> tuple[HeightStatistics, PyramidFacts]:
+    def run(self, on_progress: Progress) -> tuple[PlacedStatistics, PyramidFacts]:
         """Return what was measured."""
         levels, block = self._reader.layer.levels, self._reader.lattice.block
         bands = [-(-level.height // block) for level in levels]
@@ -155,11 +180,24 @@ class _Pass:
                 self._kept[level].pop(band, None)
                 done += 1
                 on_progress(done, total)
-        heights = tuple(max(height for height, _ in one) for one in self._differences)
-        gradient = max((gradient for _, gradient in self._differences[0]), default=None) if self._differences else None
-        return self._statistics(), PyramidFacts(heights, gradient)
+        return self._statistics(), self._facts()
 
-    def _statistics(self) -> HeightStatistics:
+    def _facts(self) -> PyramidFacts:
+        """Return how far levels are from each other."""
+        heights = tuple(max(one.height_m for one in level) for level in self._differences)
+        if not heights:
+            return PyramidFacts()
+        # A row or column that two windows share counts twice, which no deviation notices.
+        deviations = [
+            math.sqrt(math.fsum(one.squares_m2 for one in level) / max(1, sum(one.samples for one in level)))
+            for level in self._differences[:2]
+        ]
+        found = PyramidFacts(heights, max(one.gradient for one in self._differences[0]), detail_sigma_m=deviations[0])
+        if len(deviations) < 2 or not min(deviations) > 0:
+            return found
+        return replace(found, hurst=min(1.0, max(0.0, math.log2(deviations[1] / deviations[0]))))
+
+    def _statistics(self) -> PlacedStatistics:
         """Return the largest and the least of what the meters found."""
         # The first meter's distances are the least, so its slopes are the steepest.
         nearest, *others = [meter.finish() for meter in self._meters]
@@ -168,7 +206,9 @@ class _Pass:
             facing, toward = np.minimum(facing, other.tiles.facing), max(toward, other.toward)
         values = {one.name: getattr(nearest, one.name) for one in fields(nearest)}
         tiles = replace(nearest.tiles, facing=facing)
-        return PlacedStatistics(**{**values, "tiles": tiles, "toward": toward, "facing": float(facing.min())}, widest_m=self._cells[1])
+        return PlacedStatistics(
+            **{**values, "tiles": tiles, "toward": toward, "facing": float(facing.min())}, widest_m=self._cells[1], turned_deg=0.0
+        )
 
     def _row(self, level: int, y: int) -> Float32:
         """Return the heights of a block row of a level, decoded once."""
@@ -197,7 +237,7 @@ class _Pass:
             found = compare_levels(
                 np.ascontiguousarray(fine[:, left:right]), np.ascontiguousarray(coarse[:, left // 2 : -(-right // 2)]), cell
             )
-            self._differences[level].append((found.height_m, found.gradient))
+            self._differences[level].append(found)
 
 
 def _walk(level: int, band: int, bands: list[int]) -> Iterator[tuple[int, int]]:

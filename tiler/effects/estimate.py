@@ -1,11 +1,13 @@
-"""What effects change on a coarse level: no proof, but far closer to the truth than bounds where those are loose.
+"""What sky and reflected light change on a coarse level: no proof, but closer to the truth than bounds where those are loose.
 
-Horizons are marched to, sample by sample of the level: 4 % of a second for the 192 x 192 samples that a measurement keeps.
+A coarse level lacks slopes, and with them hidden sky. How much, the map itself says, twice: by its steepest facet, which is known of level
+0 (the coarse heights are exaggerated until theirs is as steep), and by how much more is hidden on a level than on one half as fine,
+for each level that is missing. The larger of both is the estimate. docs/EFFECTS.md says how it compares with what is true.
 """
 
 import math
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,62 +15,84 @@ from numpy.typing import NDArray
 from schemas.scene import Scene
 from tiler.compiled import compiled
 from tiler.effects.bounds import FULL_SCALE, code_scale
+from tiler.effects.statistics import HeightStatistics, measure_heights
 
 Float64 = NDArray[np.float64]
 
-SLOPE_GUARD: Final = 1.5
-"""Factor on horizons for the slopes that a coarse level lacks. Real terrain is about 2**(1 - H) steeper per level, H = 0.7 to 0.9."""
-LIGHT_GUARD: Final = 2.0
-"""Factor on light lost, which grows with the square of slopes, for the same."""
-_AZIMUTHS: Final = 8
+LEAST_GROWTH: Final = 1.5
+"""Factor by which lost light grows at least from a level to one twice as fine, whatever the map says of itself: the largest on real terrain
+was 1.47 (Puget Sound, ground seen, from 960 m to 160 m)."""
+_LEAST_SIDE: Final = 24
+"""Samples along the longer side of the coarsest level that is looked at."""
 
 
 @dataclass(frozen=True, slots=True)
 class Estimates:
-    """Largest changes on the coarse level, guards included [codes]."""
+    """Largest changes that level 0 is taken to have [codes]."""
 
-    shadow: float
-    penumbra: float
     sky: float
     bounce: float
     step: int
     """Samples of level 0 per sample of the level it was made on."""
+    exaggeration: float
+    """How much steeper the steepest facet of level 0 is."""
 
 
-def estimate_effects(scene: Scene, heights_m: NDArray[Any], cell_m: tuple[float, float], step: int) -> Estimates:
-    """Return what effects change on coarse heights (h, w) [m], NaN where void, whose samples are ``step`` times ``cell_m`` apart.
+def estimate_effects(scene: Scene, found: HeightStatistics) -> Estimates | None:
+    """Return what effects change, estimated on the coarse heights of ``found``.
 
-    ``cell_m`` is the distance of samples of level 0 along a row and a column [m].
+    None if nothing can be said: beside voids, where cliffs may stand that no facet tells of, or if the coarse heights are level.
     """
-    z = np.where(np.isfinite(heights_m), heights_m, np.nan).astype(np.float64)
-    cell = (cell_m[0] * step, cell_m[1] * step)
-    azimuth, elevation = scene.sun.direction_deg
-    scale = code_scale(scene.sky.share)
-    sun = SLOPE_GUARD * np.fmax(_horizons(z, azimuth, cell), 0.0)
-    hidden = np.zeros_like(z)
+    cell = (found.cell_m[0] * found.sketch_step, found.cell_m[1] * found.sketch_step)
+    z = found.sketch.astype(np.float64)
+    if found.voids or not np.isfinite(z).all():
+        return None
+    coarse = measure_heights([z], (z.shape[0], z.shape[1]), cell, found.sun_deg).steepest
+    if not coarse:
+        return None
+    exaggeration = max(1.0, found.steepest / coarse)
+    azimuths = scene.sky.azimuths
+    steep, grown = _lost(z * exaggeration, cell, azimuths), _lost(z, cell, azimuths) * _growth(z, cell, azimuths, found.sketch_step)
+    sky, ground = np.minimum(np.maximum(steep, grown), 1.0)
+    return Estimates(
+        sky=float(code_scale(scene.sky.share) * scene.sky.share * sky),
+        bounce=float(FULL_SCALE * scene.ground.albedo * ground / (1 - scene.ground.albedo * ground)),
+        step=found.sketch_step,
+        exaggeration=exaggeration,
+    )
+
+
+def _growth(z: Float64, cell: tuple[float, float], azimuths: int, step: int) -> Float64:
+    """Return by what the light lost on coarse heights ``z`` is multiplied for that on level 0: sky, ground."""
+    factor, levels = np.full(2, LEAST_GROWTH), math.log2(step)
+    finer, stride = _lost(z, cell, azimuths), 2
+    while levels and max(z.shape) // stride >= _LEAST_SIDE:
+        coarser = _lost(z[::stride, ::stride], (cell[0] * stride, cell[1] * stride), azimuths)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            factor = np.fmax(factor, finer / coarser)
+        finer, stride = coarser, 2 * stride
+    return np.asarray(factor**levels, np.float64)
+
+
+def _lost(z: Float64, cell: tuple[float, float], azimuths: int) -> Float64:
+    """Return the largest parts of the open sky's light that are hidden, and of what a sample sees that is ground, on ``z`` (h, w)."""
     slope_x, slope_y = _gradient(z, cell)
     cosine = 1 / np.sqrt(1 + slope_x**2 + slope_y**2)
-    seen = np.zeros_like(z)
-    for n in range(_AZIMUTHS):
+    open_sky, seen = np.zeros_like(z), np.zeros_like(z)
+    for n in range(azimuths):
         # Half a step off the grid's own directions.
-        turn = 2 * math.pi * (n + 0.5) / _AZIMUTHS
+        turn = 2 * math.pi * (n + 0.5) / azimuths
         rise = slope_x * math.sin(turn) - slope_y * math.cos(turn)
-        horizon = np.maximum(np.maximum(_horizons(z, math.degrees(turn), cell), rise), 0.0)
-        zenith = np.arctan2(1.0, horizon)
-        # Of a vertical plane through the zenith, all above the horizon, weighed by the normal (Dozier & Frew 1990, eq. 7b).
-        seen += cosine * (1 / (1 + horizon**2) - rise * (zenith - horizon / (1 + horizon**2))) / _AZIMUTHS
-    hidden = np.maximum((1 + cosine) / 2 - seen, 0.0)
-    lost, ground = (float(np.nanmax(part)) if np.isfinite(part).any() else 0.0 for part in (hidden, 1 - seen))
-    # Of a sun at the horizontal everything is hidden.
-    edges = (elevation, elevation - scene.sun.radius_deg)
-    point, edge = (math.tan(math.radians(angle)) if angle > 0 else -math.inf for angle in edges)
-    return Estimates(
-        shadow=scale if bool((sun > point).any()) else 0.0,
-        penumbra=scale / 2 if bool((sun > edge).any()) else 0.0,
-        sky=LIGHT_GUARD * scale * scene.sky.share * lost,
-        bounce=LIGHT_GUARD * FULL_SCALE * scene.ground.albedo * ground,
-        step=step,
-    )
+        own = np.maximum(rise, 0.0)
+        open_sky += _above(own, rise, cosine) / azimuths
+        seen += _above(np.maximum(_horizons(z, math.degrees(turn), cell), own), rise, cosine) / azimuths
+    return np.array([max(0.0, float((open_sky - seen).max())), max(0.0, float((1 - seen).max()))])
+
+
+def _above(horizon: Float64, rise: Float64, cosine: Float64) -> Float64:
+    """Return what a vertical half plane holds above a horizon, weighed by the normal (Dozier & Frew 1990, eq. 7b)."""
+    zenith, share = np.arctan2(1.0, horizon), 1 / (1 + horizon**2)
+    return np.asarray(cosine * (share - rise * (zenith - horizon * share)), np.float64)
 
 
 def _gradient(z: Float64, cell: tuple[float, float]) -> tuple[Float64, Float64]:

@@ -18,6 +18,10 @@ class LevelDifference:
     """Absolute difference of heights [m]; 0 if no sample is valid on both."""
     gradient: float
     """At least the length of the difference of slopes, as vectors."""
+    squares_m2: float
+    """Sum of the squares of differences of heights [m2]."""
+    samples: int
+    """Number of samples that are valid on both."""
 
 
 def compare_levels(fine_m: NDArray[Any], coarse_m: NDArray[Any], cell_m: tuple[float, float]) -> LevelDifference:
@@ -36,7 +40,8 @@ def compare_levels(fine_m: NDArray[Any], coarse_m: NDArray[Any], cell_m: tuple[f
     # A vertex lies on the middle of an edge of the coarser mesh, which for an odd one in both axes is the diagonal.
     first, second = coarse[np.ix_(y >> 1, x >> 1)], coarse[np.ix_((y + 1) >> 1, (x + 1) >> 1)]
     difference = 0.5 * (first + second) - fine_m[:rows, :columns]
-    if not np.isfinite(difference).any():
-        return LevelDifference(0.0, 0.0)
+    valid = difference[np.isfinite(difference)]
+    if not valid.size:
+        return LevelDifference(0.0, 0.0, 0.0, 0)
     found = measure_heights([difference], (rows, columns), cell_m, (0.0, 90.0))
-    return LevelDifference(max(found.high_m, -found.low_m), found.steepest)
+    return LevelDifference(max(found.high_m, -found.low_m), found.steepest, float(valid @ valid), valid.size)

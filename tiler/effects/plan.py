@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from schemas.effects import EffectName, EffectPlan, PlannedEffect, Verdict
 from schemas.errors import UsageError
 from schemas.scene import Scene
-from tiler.effects.bounds import linear_codes
+from schemas.viewbounds import linear_codes
 from tiler.effects.candidates import Candidate, MapBounds, PyramidFacts, map_bounds
 from tiler.effects.costs import cost_s
 from tiler.effects.estimate import Estimates, estimate_effects
@@ -28,7 +28,9 @@ _PART_OF: Final[dict[EffectName, EffectName]] = {
     "curvature_shadow": "shadow",
     "refraction_path": "curvature_shadow",
 }
-"""Effects that are nothing without another."""
+"""Effects that are nothing without another; of soft shadows the penumbra is a part as well."""
+_ESTIMATED: Final[tuple[EffectName, ...]] = ("sky", "bounce")
+"""What may be left out by an estimate. Shadows may not: one sample that stands out, which no coarse level has, shades others entirely."""
 _FREE_SHARE: Final = 1 / 8
 """Part of the tolerance that an effect which costs nothing may take: it is better spent on one that does."""
 _NEARLY: Final = 1 - 1e-6
@@ -70,14 +72,10 @@ def plan_effects(scene: Scene, found: HeightStatistics, facts: PyramidFacts | No
     tolerance = _linear(scene, scene.tolerance.codes)
     soft = scene.sun.radius_deg > 0 and scene.effects.penumbra != "off"
     limits = map_bounds(scene, found, known, soft, tolerance * _FREE_SHARE / 2)
-    ledger, estimates = _decide(scene, limits, None, tolerance), None
-    if scene.tolerance.estimates and any(ledger.verdicts[name][0] == "run" for name in _FIRST):
-        estimates = estimate_effects(scene, found.sketch, found.cell_m, found.sketch_step)
-        ledger = _decide(scene, limits, estimates, tolerance)
-    if soft and ledger.verdicts["penumbra"][0] == "skip estimated":
-        # Shadows will have hard edges after all.
-        limits = map_bounds(scene, found, known, False, tolerance * _FREE_SHARE / 2)
-        ledger = _decide(scene, limits, estimates, tolerance)
+    ledger, estimates = _decide(scene, limits, soft, tolerance), None
+    if scene.tolerance.estimates and any(ledger.verdicts[name][0] == "run" for name in _ESTIMATED):
+        estimates = estimate_effects(scene, found)
+        _leave_out_by(estimates, ledger)
     planned = [_planned(scene, found, one, ledger, limits, estimates) for one in limits.bake.values()]
     planned += [_viewed(scene, found, one) for one in limits.view.values()]
     sky_runs = ledger.verdicts["sky"][0] in ("run", "forced on")
@@ -135,31 +133,42 @@ def _sky_reach_m(found: HeightStatistics, limits: MapBounds, ledger: _Ledger) ->
     return limits.sky_reach_m if ledger.verdicts["far_occluders"][0] == "skip proven" else found.diagonal_m
 
 
-def _decide(scene: Scene, limits: MapBounds, estimates: Estimates | None, tolerance: float) -> _Ledger:
-    """Return the verdicts on all effects of a bake."""
+def _decide(scene: Scene, limits: MapBounds, soft: bool, tolerance: float) -> _Ledger:
+    """Return the verdicts on all effects of a bake, by proof."""
     ledger = _Ledger(_budget(scene, limits, tolerance), scene.tolerance.sun_deg)
+    parts: dict[EffectName, EffectName] = {**_PART_OF, "penumbra": "shadow"} if soft else _PART_OF
     for group in (_FIRST, _THEN, ("refraction_path",)):
-        ordered = sorted((limits.bake[name] for name in group), key=lambda one: one.codes)
+        # An effect that is part of another comes right after it.
+        ordered = sorted((limits.bake[name] for name in group), key=lambda one: limits.bake[_together(one.effect, parts)].codes)
         for one in ordered:
-            ledger.verdicts[one.effect] = _by_proof(scene, one, ledger)
-    if estimates is not None:
-        left = ledger.codes
-        for name in _FIRST:
-            estimate = float(getattr(estimates, name))
-            if ledger.verdicts[name][0] == "run" and estimate <= left * _NEARLY:
-                left -= estimate
-                ledger.verdicts[name] = ("skip estimated", "no proof")
-    if ledger.verdicts["penumbra"][0] in ("run", "forced on") and ledger.verdicts["shadow"][0].startswith("skip"):
+            ledger.verdicts[one.effect] = _by_proof(scene, one, ledger, parts.get(one.effect))
+    if ledger.verdicts["penumbra"][0] == "forced on" and ledger.verdicts["shadow"][0] == "skip proven":
         ledger.verdicts["shadow"] = ("run", "soft edges are part of shadows")
     return ledger
 
 
-def _by_proof(scene: Scene, one: Candidate, ledger: _Ledger) -> tuple[Verdict, str]:
-    """Return the verdict on an effect, and why if its bound does not say it."""
+def _together(effect: EffectName, parts: dict[EffectName, EffectName]) -> EffectName:
+    """Return the effect of the first group whose turn it is when that of ``effect`` comes."""
+    return parts.get(effect, effect) if effect in _FIRST else effect
+
+
+def _leave_out_by(estimates: Estimates | None, ledger: _Ledger) -> None:
+    """Leave out what estimates allow."""
+    left = ledger.codes
+    for name in _ESTIMATED:
+        if estimates is None or ledger.verdicts[name][0] != "run":
+            continue
+        estimate = float(getattr(estimates, name))
+        if estimate <= left * _NEARLY:
+            left -= estimate
+            ledger.verdicts[name] = ("skip estimated", "no proof")
+
+
+def _by_proof(scene: Scene, one: Candidate, ledger: _Ledger, whole: EffectName | None) -> tuple[Verdict, str]:
+    """Return the verdict on an effect that may be part of another, and why if its bound does not say it."""
     choice = getattr(scene.effects, one.effect)
     if choice != "auto":
         return ("forced on", "the scene says so") if choice == "on" else ("forced off", "the scene says so, whatever it changes")
-    whole = _PART_OF.get(one.effect)
     if whole is not None and ledger.verdicts[whole][0] in ("skip proven", "forced off"):
         return "skip proven", f"nothing without {whole}, and counted there"
     spare = _FREE_SHARE if cost_s(one.effect, 1, 1) == 0 else 1.0

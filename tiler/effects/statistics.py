@@ -78,6 +78,11 @@ class HeightStatistics:
         return math.hypot((self.width - 1) * self.cell_m[0], (self.height - 1) * self.cell_m[1])
 
     @property
+    def sun_turn_deg(self) -> float:
+        """At least by how much the grid's directions turn the sun anywhere, if that is known to be more than the globe does [degrees]."""
+        return 0.0
+
+    @property
     def samples(self) -> int:
         """Number of samples."""
         return self.width * self.height
@@ -86,9 +91,11 @@ class HeightStatistics:
 class HeightMeter:
     """Measures a map whose rows are pushed from the top, in bands of any height.
 
-    ``shape`` is (rows, columns) of the map, ``cell_m`` the distance of samples along a row and along a column [m]; where it differs from
-    place to place, give the least. ``sun_deg`` is azimuth and elevation [degrees]; rows run east and follow each other south.
-    ``tile_side`` is that of tiles [cells]; left out, it follows from the shape. Raises UsageError if one of them makes no sense.
+    ``shape`` is (rows, columns) of the map, ``cell_m`` the distance of samples along a row and along a column [m]. Where it differs from
+    place to place, measure with the least and with the largest of both and take what is worse, as ``tiler.effects.dataset`` does: the
+    least give the steepest slopes, but facets may face the sun the least with others. ``sun_deg`` is azimuth and elevation [degrees];
+    rows run east and follow each other south. ``tile_side`` is that of tiles [cells]; left out, it follows from the shape. Raises
+    UsageError if one of them makes no sense.
     """
 
     def __init__(
@@ -187,7 +194,7 @@ def _facing(steepest: Float64, toward: Float64, elevation_deg: float) -> Float64
     e = math.radians(elevation_deg)
     # An empty tile has no facet: 1 is the most there is.
     rise = np.where(toward > -np.inf, math.sin(e) - math.cos(e) * toward, 1.0)
-    return np.asarray(np.minimum(rise, rise / np.sqrt(1 + steepest**2)) - ROUNDING, np.float64)
+    return np.asarray(np.maximum(np.minimum(rise, rise / np.sqrt(1 + steepest**2)), -1.0) - ROUNDING, np.float64)
 
 
 def _tile_side(shape: tuple[int, int]) -> int:

@@ -105,10 +105,26 @@ def estimate_build(sources: Sequence[Path], output: str | Path, settings: BuildS
     return _Estimator(plan, output, trial, standing).estimate(store.location, opened_s)
 
 
+@dataclass(frozen=True, slots=True)
+class Beside:
+    """What a build takes before its tasks begin: time, memory that is free again when they do, and scratch files beside the dataset."""
+
+    seconds: float
+    memory_bytes: int
+    scratch_bytes: int
+
+
+def estimate_of(plan: Plan, output: str | Path, trial: Trial, standing: Standing, location: str, beside: Beside) -> BuildEstimate:
+    """Return what a build of ``plan`` at ``output``, which is called ``location``, would make and take, given a trial of its tasks."""
+    return _Estimator(plan, output, trial, standing, beside).estimate(location, beside.seconds)
+
+
 class _Estimator:
     """From a plan and a trial to an estimate."""
 
-    def __init__(self, plan: Plan, output: str | Path, trial: Trial, standing: Standing) -> None:
+    def __init__(self, plan: Plan, output: str | Path, trial: Trial, standing: Standing, beside: Beside | None = None) -> None:
+        self._beside_bytes = beside.memory_bytes if beside else 0
+        self._scratch_bytes = beside.scratch_bytes if beside else _scratch_bytes(plan.source.info)
         self._plan, self._output, self._trial, self._standing = plan, output, trial, standing
         self._remote = is_remote(output)
         self._levels = _estimate_levels(plan, trial)
@@ -119,7 +135,7 @@ class _Estimator:
         time_s = opened_s + self._time_s()
         standing = self._standing
         remaining = 0.0 if standing.act in ("nothing", "refuse") else 1 - standing.tasks_finished / standing.tasks
-        memory, available = build_memory_bytes(plan, plan.workers), available_bytes()
+        memory, available = max(build_memory_bytes(plan, plan.workers), self._beside_bytes), available_bytes()
         return BuildEstimate(
             sources=list(dict.fromkeys(str(part.path) for part in info.parts)) or [str(info.path)],
             dataset=location,
@@ -169,7 +185,7 @@ class _Estimator:
         folders = 3 + plan.lattice.levels + sum(1 + _task_grid(plan, tier)[1] for tier in plan.tiers)
         room = None if self._remote else _Room.at(nearest_folder(folder_of(self._output)))
         whole = stored_bytes + blocks * RECORD_BYTES + record_bytes + piece_bytes
-        scratch = 0 if self._remote else _scratch_bytes(plan.source.info)
+        scratch = 0 if self._remote else self._scratch_bytes
         return SpaceEstimate(
             stored_bytes=stored_bytes,
             stored_bytes_low=max(stored_bytes - doubt, sum(level.stored_bytes for level in self._trial.levels)),

@@ -23,7 +23,8 @@ SPOOL_BYTES: Final = 64 << 20
 """A picture that must be decoded as a whole is kept in memory up to this size, else in a scratch file (``tiler.rowfile``)."""
 _GDAL_SHARE: Final = 0.05
 """GDAL keeps decoded tiles in up to this share of the machine's memory; they were seen to take a third more than they count."""
-_OIIO_FORMATS: Final = {"tiff", "openexr"}
+_UNCACHED: Final = {"tiff", "openexr", "clipmap"}
+"""Formats of which nothing that is decoded is kept: those that OpenImageIO reads, and heights of a dataset for light."""
 
 
 def build_memory_bytes(plan: Plan, workers: int) -> int:
@@ -85,7 +86,7 @@ def _source_bytes(plan: Plan) -> int:
     decoded = info.width * info.height * info.channels * info.dtype.itemsize
     if info.layout == "sequential":
         return decoded if decoded <= SPOOL_BYTES else 0
-    return 0 if info.format in _OIIO_FORMATS else int(1.3 * min(decoded, _GDAL_SHARE * total_bytes()))
+    return 0 if info.format in _UNCACHED else int(1.3 * min(decoded, _GDAL_SHARE * total_bytes()))
 
 
 def _ledger_bytes(plan: Plan) -> int:

@@ -1,8 +1,8 @@
 """Trial tasks: windows spread over a source are read, filtered, cut and encoded as a build would do it, and nothing is stored."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from math import sqrt
 from pathlib import Path
@@ -11,6 +11,8 @@ from typing import Final
 from schemas.errors import NotFoundError, UsageError
 from schemas.region import Rect
 from tiler.building.plan import Plan
+from tiler.estimate.memory import task_windows
+from tiler.sources.convert import SampleSource
 from tiler.stores import Claim
 from tiler.tasks.cut import StageTimes, Target
 from tiler.tasks.destination import NewBlocks
@@ -91,8 +93,13 @@ class _Nowhere:
         """Do nothing."""
 
 
-def try_windows(plan: Plan, stamps: SourceStamps, threads: int) -> Trial:
-    """Run tasks on windows spread over the source of ``plan``; raises InputError or StorageError if it cannot be read there."""
+def try_windows(
+    plan: Plan, stamps: SourceStamps, threads: int, open_window: Callable[[Rect], AbstractContextManager[SampleSource]] | None = None
+) -> Trial:
+    """Run tasks on windows spread over the source of ``plan``; raises InputError or StorageError if it cannot be read there.
+
+    ``open_window`` gives a source to read a window of samples from, where that of the plan cannot be read before a build.
+    """
     cells = _Cells(plan)
     target = Target(
         _Nowhere(),
@@ -102,7 +109,14 @@ def try_windows(plan: Plan, stamps: SourceStamps, threads: int) -> Trial:
         plan.codec,
         plan.linear_light,
     )
-    worker = TaskWorker(plan, target, RecordBook(_Nowhere(), plan.name), stamps)
+    book = RecordBook(_Nowhere(), plan.name)
+
+    def worker(work: Work) -> Done:
+        if open_window is None:
+            return TaskWorker(plan, target, book, stamps)(work)
+        with open_window(task_windows(plan, work.task)[0]) as source:
+            return TaskWorker(replace(plan, source=source), target, book, stamps)(work)
+
     order = cells.spread()
     # Alone, so that its time does not hide in that of the others.
     done = [worker(Work(cells.task(next(order))))]

@@ -32,10 +32,12 @@ class Form:
 
 
 FORMS: Final = {
-    "pmtiles": Form("tiler.export.pmtiles", "write_pmtiles", (".pmtiles",), ("imagery", "height", "light")),
-    "cog": Form("tiler.export.cog", "write_cog", (".tif", ".tiff"), ("imagery", "height", "light")),
-    "dzi": Form("tiler.export.dzi", "write_dzi", (".dzi",), ("imagery", "light"), "heights are no pictures; export them as cog or exr"),
-    "exr": Form("tiler.export.exr", "write_exr", (".exr",), ("imagery", "height", "light")),
+    "pmtiles": Form("tiler.export.pmtiles", "write_pmtiles", (".pmtiles",), ("imagery", "height", "light", "normal")),
+    "cog": Form("tiler.export.cog", "write_cog", (".tif", ".tiff"), ("imagery", "height", "light", "normal")),
+    "dzi": Form(
+        "tiler.export.dzi", "write_dzi", (".dzi",), ("imagery", "light"), "heights and normals are no pictures; export them as cog or exr"
+    ),
+    "exr": Form("tiler.export.exr", "write_exr", (".exr",), ("imagery", "height", "light", "normal")),
 }
 
 

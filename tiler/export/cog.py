@@ -42,8 +42,8 @@ class _TileForm:
 def write_cog(dataset: Dataset, name: str, target: Path, job: Job) -> Exported:
     """Write layer ``name`` to the file ``target``.
 
-    Blocks of jpeg and webp without a pad become tiles byte for byte; all others are decoded and stored without further loss
-    (DEFLATE, with the predictor for their type). Voids of heights are NaN, which is declared as nodata; alpha stays alpha, not
+    Blocks of jpeg and webp without a pad, but for light in webp, become tiles byte for byte; all others are decoded and stored without
+    further loss (DEFLATE, with the predictor for their type). Voids of heights are NaN, which is declared as nodata; alpha stays alpha, not
     premultiplied. Raises InputError or NotFoundError for a damaged dataset, StorageError if the file cannot be written.
     """
     pyramid = Pyramid(dataset, name, _LARGEST_WITHOUT_OVERVIEW)
@@ -95,7 +95,9 @@ def _tile(pyramid: Pyramid, form: _TileForm, level: int, rect: Rect) -> tuple[by
 def _choose_form(pyramid: Pyramid) -> _TileForm:
     layer, codec = pyramid.layer, pyramid.layer.codec.partition(":")[0]
     side = max(layer.block, _SMALLEST_TILE)
-    if codec in _COPIED and layer.pad == 0 and side == layer.block:
+    # Light in WebP is three equal channels, and would be one in the TIFF.
+    alike = codec != "webp" or layer.channels - layer.alpha == 3
+    if codec in _COPIED and alike and layer.pad == 0 and side == layer.block:
         options = {"compress": _COPIED[codec]}
         if codec == "jpeg" and layer.channels == 3:
             options["photometric"] = "YCBCR"

@@ -31,12 +31,16 @@ _Tile = tuple[int, Rect]
 
 
 def write_dzi(dataset: Dataset, name: str, target: Path, job: Job) -> Exported:
-    """Write layer ``name`` of imagery to ``target`` and the folder beside it; the ``.dzi`` comes last.
+    """Write layer ``name`` of imagery or light to ``target`` and the folder beside it; the ``.dzi`` comes last.
 
     Blocks that lie wholly inside their level are copied byte for byte if the codec is jpeg, png or webp; those at the edges are cut to
-    the level and encoded again with the same codec. Other codecs become png. Raises UsageError if something that is no
-    folder has the folder's name, InputError or NotFoundError for a damaged dataset, StorageError if something cannot be written.
+    the level and encoded again with the same codec. Other codecs become png. Raises UsageError for light in floats, or if something that is
+    no folder has the folder's name, InputError or NotFoundError for a damaged dataset, StorageError if something cannot be written.
     """
+    if dataset.manifest.layer(name).dtype == "float32":
+        raise UsageError(
+            f"layer {name!r} holds light in floats, which no picture can: export it as exr or cog, or build it with --codec png"
+        )
     pyramid = Pyramid(dataset, name, 1)
     picture = _Picture(pyramid)
     folder = target.with_name(f"{target.stem}_files")

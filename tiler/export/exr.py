@@ -10,6 +10,7 @@ import OpenImageIO
 from numpy.typing import NDArray
 
 from schemas.errors import StorageError, UsageError
+from schemas.light import Normals
 from schemas.manifest import Layer, Manifest
 from schemas.region import Rect
 from tiler.checking.blockreader import DecodedBlock
@@ -29,13 +30,16 @@ _SMALLEST_TILE: Final = 16
 _MAX_SIDE: Final = (1 << 31) - 1
 _HALF_MAX: Final = 65504.0
 _NAMES: Final = {1: ("Y",), 3: ("R", "G", "B")}
+_OF_NORMALS: Final = ("N.X", "N.Y")
+"""As renderers name the parts of normals."""
 
 
 def write_exr(dataset: Dataset, name: str, target: Path, job: Job) -> Exported:
     """Write layer ``name`` to the file ``target``, ZIP-compressed, in tiles of the layer's block side.
 
-    Heights are channel Y in metres, with A (1 valid, 0 void, where Y is 0) if the layer has voids. 8-bit imagery, and imagery filtered
-    in linear light, is decoded from sRGB to light, other integers are divided by their largest value; colour is premultiplied by A.
+    Heights are channel Y in metres, with A (1 valid, 0 void, where Y is 0) if the layer has voids; normals are N.X and N.Y. 8-bit imagery,
+    and imagery filtered in linear light, is decoded from sRGB to light, other integers are divided by their largest value; colour is
+    premultiplied by A.
     Raises UsageError if half floats cannot hold the values or the layer has two or four colours, InputError or NotFoundError for a damaged
     dataset, StorageError if the file cannot be written.
     """
@@ -87,6 +91,8 @@ class _Conversion:
 
 
 def _conversion(layer: Layer, *, codes: bool) -> _Conversion:
+    if layer.normals is not None:
+        return _of_normals(layer, layer.normals)
     names = _NAMES[layer.channels - layer.alpha]
     if layer.dtype == "float32":
         voids = layer.statistics.valid < layer.width * layer.height
@@ -100,8 +106,19 @@ def _conversion(layer: Layer, *, codes: bool) -> _Conversion:
     return _Conversion(names, f"codes / {top}", lambda samples: samples.astype(np.float32) / np.float32(top), alpha)
 
 
+def _of_normals(layer: Layer, normals: Normals) -> _Conversion:
+    """Return x and y themselves, whatever their codes; they are not multiplied by the mask."""
+    voids = layer.statistics.valid < layer.width * layer.height
+
+    def convert(samples: NDArray[Any]) -> Pixels:
+        found = (samples[..., :2] - np.float32(normals.zero)) / np.float32(normals.one)
+        return np.where(samples[..., 2:] > 0, found, np.float32(0)) if layer.alpha else found
+
+    return _Conversion((*_OF_NORMALS, "A") if voids else _OF_NORMALS, "x and y of unit normals", convert, "mask" if voids else "")
+
+
 def _refuse_unfit(layer: Layer, name: str, half: bool) -> None:
-    if layer.channels - layer.alpha not in _NAMES:
+    if layer.kind != "normal" and layer.channels - layer.alpha not in _NAMES:
         raise UsageError(f"layer {name!r} has {layer.channels - layer.alpha} colours, and exr holds 1 or 3; export it as cog")
     if max(layer.width, layer.height) > _MAX_SIDE:
         raise UsageError(f"layer {name!r} has a side of more than {_MAX_SIDE} samples, which exr cannot hold; export it as cog")

@@ -39,7 +39,8 @@ def geotiff_tags(manifest: Manifest, layer: Layer, compression: dict[str, Any]) 
         "blockxsize": 16,
         "blockysize": 16,
         "photometric": "RGB" if colours == 3 else "MINISBLACK",
-        "ALPHA": "NON-PREMULTIPLIED" if layer.alpha else "NO",
+        # GDAL takes the first channel that is no colour for alpha, and normals have two: of them it is told below.
+        "ALPHA": "NON-PREMULTIPLIED" if layer.alpha and colours != 2 else "NO",
         "SPARSE_OK": True,
         "BIGTIFF": "NO",
         "ENDIANNESS": "LITTLE",

@@ -2,8 +2,9 @@
 
 ``antisymmetric`` (heights): point reflection about the outermost sample, ``z[-k] = 2 z[0] - z[k]``, which continues a
 ramp exactly; coarse samples on the edge equal their fine ones. ``mirror`` (imagery): reflection about the outer side of
-the outermost cell, ``z[-1-k] = z[k]``, which never leaves the range of the image. Both are repeated where the level is
-smaller than the kernel.
+the outermost cell, ``z[-1-k] = z[k]``, which never leaves the range of the image. ``mirror-sample`` (light, normals):
+reflection about the outermost sample, ``z[-k] = z[k]``, which never leaves the range either and leaves samples where they
+lie; heights that go on antisymmetrically have slopes that go on so. All are repeated where the level is smaller than the kernel.
 """
 
 from collections.abc import Callable
@@ -14,7 +15,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-EdgeRule = Literal["antisymmetric", "mirror"]
+EdgeRule = Literal["antisymmetric", "mirror", "mirror-sample"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +33,11 @@ def _mirror(index: int, size: int) -> Term:
     return Term(min(place, 2 * size - 1 - place))
 
 
+def _mirror_sample(index: int, size: int) -> Term:
+    place = index % max(2 * (size - 1), 1)
+    return Term(min(place, 2 * (size - 1) - place))
+
+
 def _antisymmetric(index: int, size: int) -> Term:
     if size == 1:
         return Term(0)
@@ -43,7 +49,11 @@ def _antisymmetric(index: int, size: int) -> Term:
     return Term(2 * (size - 1) - place, -1, -2 * period, 2 * period + 2)
 
 
-_RULES: Final[dict[EdgeRule, Callable[[int, int], Term]]] = {"antisymmetric": _antisymmetric, "mirror": _mirror}
+_RULES: Final[dict[EdgeRule, Callable[[int, int], Term]]] = {
+    "antisymmetric": _antisymmetric,
+    "mirror": _mirror,
+    "mirror-sample": _mirror_sample,
+}
 
 
 @lru_cache(maxsize=256)

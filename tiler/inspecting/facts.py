@@ -50,6 +50,7 @@ def describe_layer(dataset: Dataset, name: str) -> LayerFacts:
         fill=layer.fill,
         enhance=layer.enhance,
         light=layer.light,
+        normals=layer.normals,
         transform=layer.transform,
         extent=layer.extent,
         ground_spacing_m=layer.ground_spacing_m,

@@ -1,4 +1,4 @@
-"""A decoded block as a PNG to look at: pictures as they are, heights as shaded relief, voids transparent."""
+"""A decoded block as a PNG to look at: pictures as they are, heights and normals as shaded relief, voids transparent."""
 
 from math import cos, radians, sin
 from typing import Any, Final
@@ -7,6 +7,7 @@ import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.light import Normals
 from schemas.manifest import Layer
 from tiler.checking.blockreader import DecodedBlock
 
@@ -23,6 +24,8 @@ _CUT_PERCENT: Final = 2.0
 
 def preview_png(layer: Layer, level: int, core: DecodedBlock) -> bytes:
     """Return the PNG of a decoded core (rows, columns, channels), 8 bits a channel; alpha only if there are voids or an alpha channel."""
+    if layer.normals is not None:
+        return bytes(imagecodecs.png_encode(_faced(layer.normals, core)))
     return bytes(imagecodecs.png_encode(_relief(layer, level, core) if layer.kind == "height" else _picture(layer, core)))
 
 
@@ -48,6 +51,15 @@ def _relief(layer: Layer, level: int, core: DecodedBlock) -> Picture:
     if not core.valid.all():
         return np.concatenate([_bytes(grey), _bytes(core.valid[..., np.newaxis].astype(np.float64))], axis=-1)
     return _squeezed(_bytes(grey))
+
+
+def _faced(normals: Normals, core: DecodedBlock) -> Picture:
+    """Return Lambert's cosine between normals and sun as grey; voids are transparent."""
+    x, y = np.moveaxis((core.samples[..., :2].astype(np.float64) - normals.zero) / normals.one, -1, 0)
+    azimuth, elevation = radians(_SUN_AZIMUTH_DEG), radians(_SUN_ELEVATION_DEG)
+    upright = np.sqrt(np.maximum(1 - x**2 - y**2, 0))
+    grey = _bytes(sin(elevation) * upright + cos(elevation) * (sin(azimuth) * x + cos(azimuth) * y))
+    return grey if core.valid.all() else np.stack([grey, _bytes(core.valid.astype(np.float64))], axis=-1)
 
 
 def _shade(heights_m: NDArray[np.float64], east_m: float, south_m: float) -> NDArray[np.float64]:

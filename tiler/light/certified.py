@@ -10,12 +10,12 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tiler.light.frame import Earth, Frame, Shape, SunPosition
-from tiler.light.marching import FINEST, Int64, bracket_rows, build_maxima, darken_rows, march_undecided, range_of
+from tiler.light.marching import bracket_rows, darken_rows, march_undecided, range_of
 from tiler.light.shadow import Rays, check_rows, rays_of, uniform_codes
 from tiler.light.sweeping import NOTHING, VOID, Codes, Float32, Float64
+from tiler.light.terrainkept import KeptTerrain
 from tiler.light.turning import turned
 
 _ROUNDING: Final = 2.0**-48
@@ -61,14 +61,13 @@ class CertifiedSweep:
         self.rays = rays_of(shape, cell_m, sun, earth, bias_m=bias_m, sea_m=sea_m, reference=reference)
         self.voids = 0
         self.marched = 0
-        self._range_m = range_m
-        self._reach = self.frame.rows
+        reach = self.frame.rows
         if range_m is not None and self.rays.level is None:
-            self._reach = reach_rows(self.rays, range_m[1] - range_m[0])
+            reach = reach_rows(self.rays, range_m[1] - range_m[0])
         self._row = 0
-        self._kept = np.empty((0, self.frame.columns), np.float32)
-        self._bounds = _fresh(0, self.frame.columns + 1)
-        self._highest = 0.0
+        self._kept = KeptTerrain(self.rays, reach)
+        self._brackets = Brackets(self.rays)
+        self._extent = HeightExtent(self.rays, range_m)
 
     @property
     def frame(self) -> Frame:
@@ -78,25 +77,69 @@ class CertifiedSweep:
     def push(self, rows_m: Float32) -> Codes:
         """Return the codes (h, columns) uint8 of the next ``rows_m`` (h, columns) float32 [m] of the frame; no number is a void."""
         check_rows(self.frame, self._row, rows_m)
-        if self.rays.level is not None:
-            codes = uniform_codes(rows_m, self.rays.level)
+        rays = self.rays
+        if rays.level is not None:
+            codes = uniform_codes(rows_m, rays.level)
         else:
-            codes = self._bracketed(rows_m)
-            heights = np.concatenate((self._kept, rows_m)) if self._kept.size else rows_m
-            self._march(heights, codes)
-            frame, rays = self.frame, self.rays
+            highest = self._extent.grown(rows_m)
+            codes = self._brackets.push(rows_m, highest)
+            self._kept.push(rows_m)
+            if (codes > VOID).any():
+                self._march(codes, highest)
             darken_rows(rows_m, self._row, rays.slope, rays.sea_m, rays.lift, codes)
-            self._kept = heights[max(0, heights.shape[0] - min(self._reach, frame.rows)) :].copy()
         self._row += rows_m.shape[0]
         self.voids += int(np.count_nonzero(codes == VOID))
         return codes
 
-    def _bracketed(self, rows_m: Float32) -> Codes:
-        """Return the codes of the next rows as far as the bounds tell, and move these on."""
-        rays, shift = self.rays, self.frame.shift
-        self._highest = max(self._highest, self._extent(rows_m))
-        offsets = sorted((math.floor(shift * self._row), math.floor(shift * (self._row + rows_m.shape[0]))))
-        first, bounds = _fresh(offsets[0], self.frame.columns + 1 + offsets[1] - offsets[0] + 1)
+    def _march(self, codes: Codes, highest: float) -> None:
+        """Decide what the bounds left open in ``codes``, of the last rows."""
+        rays, frame, kept = self.rays, self.frame, self._kept
+        peaks, table, maxima = kept.pyramid()
+        slack = slack_of(rays, highest)
+        self.marched += march_undecided(
+            kept.heights, kept.first, frame.shift, rays.slope, frame.step_m, rays.bias_m, slack, rays.lift, peaks, table, maxima, codes
+        )
+
+
+def slack_of(rays: Rays, highest: float) -> float:
+    """Return by how much rounding may raise interpolated heights that are at most so far from 0 [m], lifted where ground is curved."""
+    return 0.0 if rays.lift[4] == 0 else _ROUNDING * highest
+
+
+class HeightExtent:
+    """A bound on the size of all lifted heights so far; ``range_m`` is what heights were said to have."""
+
+    def __init__(self, rays: Rays, range_m: tuple[float, float] | None) -> None:
+        self._range_m = range_m
+        self._lifted = rays.lift[4] * _farthest_m(rays.frame) ** 2
+        self._highest = 0.0
+
+    def grown(self, rows_m: Float32) -> float:
+        """Return the bound [m] with the next rows; ValueError if they are not as promised."""
+        lowest, highest = range_of(rows_m)
+        if lowest > highest:
+            return self._highest
+        if self._range_m is not None and not (self._range_m[0] <= lowest and highest <= self._range_m[1]):
+            raise ValueError(
+                f"heights of {lowest} to {highest} m in a grid that was said to have {self._range_m[0]} to {self._range_m[1]} m"
+            )
+        self._highest = max(self._highest, max(abs(lowest), abs(highest)) + self._lifted)
+        return self._highest
+
+
+class Brackets:
+    """The bounds of the strips between the lines of a sweep, carried from band to band: ``push`` rows, get what is certain."""
+
+    def __init__(self, rays: Rays) -> None:
+        self._rays = rays
+        self._row = 0
+        self._bounds = _fresh(0, rays.frame.columns + 1)
+
+    def push(self, rows_m: Float32, highest: float) -> Codes:
+        """Return the codes of the next rows as far as the bounds tell, else UNDECIDED, and move these on; heights are up to ``highest``."""
+        rays, frame = self._rays, self._rays.frame
+        offsets = sorted((math.floor(frame.shift * self._row), math.floor(frame.shift * (self._row + rows_m.shape[0]))))
+        first, bounds = _fresh(offsets[0], frame.columns + 1 + offsets[1] - offsets[0] + 1)
         known_first, known = self._bounds
         start, stop = max(first, known_first), min(first + bounds.shape[2], known_first + known.shape[2])
         bounds[:, :, start - first : stop - first] = known[:, :, start - known_first : stop - known_first]
@@ -104,11 +147,11 @@ class CertifiedSweep:
         bracket_rows(
             np.ascontiguousarray(rows_m),
             self._row,
-            shift,
+            frame.shift,
             rays.slope,
-            self.frame.step_m,
+            frame.step_m,
             rays.bias_m,
-            self._highest,
+            highest,
             rays.lift,
             first,
             bounds[0],
@@ -116,35 +159,8 @@ class CertifiedSweep:
             codes,
         )
         self._bounds = first, bounds
+        self._row += rows_m.shape[0]
         return codes
-
-    def _extent(self, rows_m: Float32) -> float:
-        """Return a bound on the size of the lifted heights of ``rows_m``; check that they are as promised."""
-        lowest, highest = range_of(rows_m)
-        if lowest > highest:
-            return 0.0
-        if self._range_m is not None and not (self._range_m[0] <= lowest and highest <= self._range_m[1]):
-            raise ValueError(
-                f"heights of {lowest} to {highest} m in a grid that was said to have {self._range_m[0]} to {self._range_m[1]} m"
-            )
-        frame, curvature = self.frame, self.rays.lift[4]
-        return max(abs(lowest), abs(highest)) + curvature * _farthest_m(frame) ** 2
-
-    def _march(self, heights_m: Float32, codes: Codes) -> None:
-        """Decide what the bounds left open in ``codes``, of the last rows of ``heights_m``."""
-        if not (codes > VOID).any():
-            return
-        rays, frame = self.rays, self.frame
-        first = self._row - (heights_m.shape[0] - codes.shape[0])
-        table = _pyramid_table(heights_m.shape)
-        maxima = np.empty(int(table[-1, 0] + table[-1, 1] * table[-1, 2]), np.float64)
-        peaks = np.empty(heights_m.shape[0], np.float64)
-        drop = frame.step_m * rays.slope
-        build_maxima(heights_m, first, drop, rays.lift, peaks, table, maxima)
-        slack = 0.0 if rays.lift[4] == 0 else _ROUNDING * self._highest
-        self.marched += march_undecided(
-            heights_m, first, frame.shift, rays.slope, frame.step_m, rays.bias_m, slack, rays.lift, peaks, table, maxima, codes
-        )
 
 
 def _fresh(first: int, count: int) -> tuple[int, Float64]:
@@ -157,18 +173,6 @@ def _farthest_m(frame: Frame) -> float:
     rows = max(abs(frame.reference_row), abs(frame.rows - frame.reference_row))
     columns = max(abs(frame.reference_column), abs(frame.columns - frame.reference_column))
     return abs(frame.row_m) * rows + abs(frame.column_m) * columns
-
-
-def _pyramid_table(shape: tuple[int, ...]) -> Int64:
-    """Return (offset, rows, columns) of each level of the pyramid of maxima over heights of ``shape``."""
-    rows, columns = (-(-size >> FINEST) for size in shape)
-    levels, offset = [(0, rows, columns)], 0
-    while max(rows, columns) > 1:
-        offset += rows * columns
-        rows, columns = -(-rows // 2), -(-columns // 2)
-        levels.append((offset, rows, columns))
-    table: NDArray[np.int64] = np.array(levels, np.int64)
-    return table
 
 
 def certified_shadow(

@@ -1,17 +1,14 @@
 """How much of the sun's disc stands above a horizon. Compiled, outside the GIL."""
 
 import math
-from typing import Final
 
 import numpy as np
 
 from schemas.errors import UsageError
+from schemas.scene import SUN_RADIUS_DEG
 from tiler.compiled import compiled
 from tiler.light.frame import tangent_deg
 from tiler.light.sweeping import Float32, Float64
-
-SUN_RADIUS_DEG: Final = 0.2666
-"""Angular radius of the sun at its mean distance: 696 000 km over 149.6 million km; 1.7 % more in January, less in July."""
 
 
 @compiled

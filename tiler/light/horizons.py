@@ -2,12 +2,15 @@
 
 What is farther than ``near_steps`` rows of the frame is taken from hulls along lines one column apart; what is nearer is looked at from
 the sample itself. The hulls alone leave an error of some tenths of a degree, because near ground between two lines is unlike both;
-the exact steps bring it down about as 1 / steps. The sky needs none, the sun's disc 8 or more.
+the exact steps bring it down about as 1 / steps. Sky and the sun's disc both need 8 or more.
 
 Voids (no number, or infinite) have no horizon and are none. A sample with no terrain toward the azimuth has one of minus infinity.
 """
 
-from typing import Final
+from collections.abc import Callable
+from concurrent.futures import Executor
+from itertools import pairwise
+from typing import Final, TypeVar
 
 import numpy as np
 
@@ -18,7 +21,13 @@ from tiler.light.shadow import check_rows
 from tiler.light.sweeping import Float32, Float64
 from tiler.light.turning import transposed, turned
 
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
 MAX_NEAR_STEPS: Final = 1024
+_NEAR_ROWS: Final = 32
+_LINES: Final = 1024
+"""Rows, and lines, that one thread works at."""
 BAND_ROWS: Final = 512
 """Rows that ``horizon_tangents`` pushes at once: hulls are carried between bands at a cost that is then some percent."""
 
@@ -49,17 +58,29 @@ class HorizonSweep:
 
     ``shape`` is the grid's (rows, columns), ``cell_m`` the distance [m] between its samples along a row and along a column. On a round
     ``earth`` tangents are above the local horizontal, with what lies far away as low as it is seen. Between bands the hulls of the
-    lines are kept, some tens of corners each, and ``near_steps`` rows; bands of any height give the same bits.
+    lines are kept, some tens of corners each, and ``near_steps`` rows; bands of any height give the same bits. With the height of its
+    lowest ground, ``lowest_m``, only horizons above the horizontal are looked for, which is faster on a round Earth; others are 0. A
+    ``pool`` of threads may help.
     """
 
     def __init__(
-        self, shape: Shape, cell_m: tuple[float, float], azimuth_deg: float, earth: Earth | None = None, *, near_steps: int = 16
+        self,
+        shape: Shape,
+        cell_m: tuple[float, float],
+        azimuth_deg: float,
+        earth: Earth | None = None,
+        *,
+        near_steps: int = 16,
+        lowest_m: float | None = None,
+        pool: Executor | None = None,
     ) -> None:
         if not 0 <= near_steps <= MAX_NEAR_STEPS:
             raise UsageError(f"{near_steps} exact steps: give 0 to {MAX_NEAR_STEPS}")
         self.frame: Frame = frame_of(shape, cell_m, azimuth_deg)
         self.near_steps = near_steps
         self._curvature = curvature_per_m(earth)
+        self._lowest_m = lowest_m
+        self._pool = pool
         self._row = 0
         self._kept = np.empty((0, self.frame.columns), np.float32)
         self._hulls = _Hulls(0, np.zeros(1, np.int64), np.empty(0, np.int32), np.empty(0), np.empty((0, near_steps)))
@@ -72,10 +93,16 @@ class HorizonSweep:
         tangents = self._far(rows_m)
         heights = np.concatenate((self._kept, rows_m)) if self._kept.size else np.ascontiguousarray(rows_m)
         frame = self.frame
-        near_steps(heights, frame.shift, frame.step_m, self._curvature, self.near_steps, tangents)
+
+        def look_near(start: int) -> None:
+            seen = heights[: heights.shape[0] - tangents.shape[0] + start + _NEAR_ROWS]
+            part = tangents[start : start + _NEAR_ROWS]
+            near_steps(seen, frame.shift, frame.step_m, self._curvature, self.near_steps, part)
+
+        self._each(look_near, list(range(0, tangents.shape[0], _NEAR_ROWS)))
         self._kept = heights[max(0, heights.shape[0] - self.near_steps) :].copy()
         self._row += rows_m.shape[0]
-        return tangents
+        return tangents if self._lowest_m is None else np.maximum(tangents, np.float32(0))
 
     def _far(self, rows_m: Float32) -> Float32:
         """Return the tangents of what is more than ``near_steps`` rows away, and carry the hulls on."""
@@ -86,34 +113,66 @@ class HorizonSweep:
             return np.empty((0, width), np.float32)
         first, stop = int(wholes.min()), width + 1 + int(wholes.max())
         old = self._hulls.within(first, stop)
-        lines, room = stop - first, old.rows.size + (stop - first) * (count + 1)
-        new = _Hulls(
-            first, np.zeros(lines + 1, np.int64), np.empty(room, np.int32), np.empty(room), np.empty((lines, self.near_steps), np.float64)
-        )
         far = np.full((width, count), NO_HORIZON, np.float32)
+        columns, rests = transposed(rows_m), offsets - wholes
+
+        def walk(part: tuple[int, int]) -> _Hulls:
+            return self._walked(old, part, columns, wholes, rests, far)
+
+        lines = stop - first
+        parts = 1 if self._pool is None else max(1, lines // _LINES)
+        ends = [lines * part // parts for part in range(parts + 1)]
+        self._hulls = _joined(first, self._each(walk, list(pairwise(ends))))
+        return transposed(far)
+
+    def _each(self, work: Callable[[Item], Result], items: list[Item]) -> list[Result]:
+        """Return what ``work`` makes of each item, by the pool if there is one."""
+        return list(map(work, items) if self._pool is None else self._pool.map(work, items))
+
+    def _walked(self, old: _Hulls, part: tuple[int, int], columns: Float32, wholes: Int64, rests: Float64, far: Float32) -> _Hulls:
+        """Walk the lines from ``part[0]`` up to before ``part[1]`` of ``old``, set what lies before each, and return their hulls."""
+        # What lies before the first line is between it and the one before, which is walked once more for that.
+        begin = max(part[0] - 1, 0)
+        starts, count = old.starts[begin : part[1] + 1], columns.shape[1]
+        lines, room = part[1] - begin, int(starts[-1] - starts[0]) + (part[1] - begin) * (count + 1)
+        new = _Hulls(
+            old.first + begin, np.zeros(lines + 1, np.int64), np.empty(room, np.int32), np.empty(room), np.empty((lines, self.near_steps))
+        )
         walk_lines(
-            transposed(rows_m),
+            columns,
             self._row,
             self.frame.shift,
             wholes,
-            offsets - wholes,
+            rests,
             self.frame.step_m,
             self._curvature,
+            -np.inf if self._lowest_m is None else self._lowest_m,
             self.near_steps,
-            first,
-            old.starts,
+            part[0] > 0,
+            new.first,
+            starts,
             old.rows,
             old.heights,
-            old.waiting,
+            old.waiting[begin : part[1]],
             new.starts,
             new.rows,
             new.heights,
             new.waiting,
             far,
         )
-        used = int(new.starts[-1])
-        self._hulls = _Hulls(first, new.starts, new.rows[:used].copy(), new.heights[:used].copy(), new.waiting)
-        return transposed(far)
+        return new.within(old.first + part[0], old.first + part[1])
+
+
+def _joined(first: int, parts: list[_Hulls]) -> _Hulls:
+    """Return the hulls of lines one after the other."""
+    sizes = np.concatenate([np.diff(part.starts) for part in parts])
+    return _Hulls(
+        first,
+        np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
+        np.concatenate([part.rows for part in parts]),
+        np.concatenate([part.heights for part in parts]),
+        np.concatenate([part.waiting for part in parts]),
+    )
 
 
 def horizon_tangents(

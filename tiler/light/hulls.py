@@ -86,6 +86,12 @@ def _heights_of_line(
 
 
 @compiled
+def _least(lowest: float, curvature: float, distance: float) -> float:
+    """Return the lifted height of the lowest ground at a distance along a line; minus infinity if it is not known."""
+    return lowest - curvature * distance * distance
+
+
+@compiled
 def walk_lines(
     columns: Float32,
     first_row: int,
@@ -94,7 +100,9 @@ def walk_lines(
     rests: Float64,
     step_m: float,
     curvature: float,
+    lowest: float,
     delay: int,
+    joined: bool,
     first_line: int,
     starts: Int64,
     corner_rows: Int32,
@@ -111,11 +119,16 @@ def walk_lines(
     Line n crosses row i ``rests[i]`` to the left of column n - wholes[i]. Only what is more than ``delay`` rows away counts. At the
     outset the hull of line ``first_line + k`` has the corners from ``starts[k]`` to ``starts[k + 1]``; the heights it met on the ``delay``
     rows above, NaN where there was none, wait in ``waiting[k]``. What the band leaves goes into the ``new_`` arrays.
+
+    If the lines are ``joined`` to others, nothing is written before the first of them: that is for whom walks the lines up to it.
+    No ground is below ``lowest`` (minus infinity if that is not known): what does not rise above the horizontal of ground that low is no
+    corner, and no horizon is lower. On a round Earth a sea is convex, and each of its samples would be one: a stack of thousands per line.
     """
     height = columns.shape[1]
     distances = step_m * np.arange(first_row, first_row + height)
     lifts = curvature * distances * distances
-    before, here = np.full(height, NO_HORIZON), np.full(height, NO_HORIZON)
+    floor = NO_HORIZON if math.isinf(lowest) else 0.0
+    before, here = np.full(height, floor), np.full(height, floor)
     most = np.max(starts[1:] - starts[:-1]) + height + delay
     corners, heights = np.empty(most, np.float64), np.empty(most, np.float64)
     met, own = np.empty(delay + height, np.float64), np.empty(height, np.float64)
@@ -130,20 +143,24 @@ def walk_lines(
         _heights_of_line(columns, line, wholes, rests, lifts, shift, met[delay:], own)
         for i in range(height):
             # met[i] is delay rows up: the first that is near here, and the next to be a corner
-            here[i] = NO_HORIZON
+            here[i] = floor
             row = np.float64(first_row + i)
             if size > 0 and not math.isnan(own[i]):
                 top = _horizon_corner(corners, heights, size, row, own[i])
-                here[i] = (heights[top] - own[i]) / ((row - corners[top]) * step_m) - 2.0 * curvature * distances[i]
-            if not math.isnan(met[i]):
+                tangent = (heights[top] - own[i]) / ((row - corners[top]) * step_m) - 2.0 * curvature * distances[i]
+                here[i] = max(tangent, floor)
+            if met[i] > _least(lowest, curvature, step_m * (row - delay)):
                 size = _push_corner(corners, heights, size, row - delay, met[i])
         for n in range(size):
-            new_corner_rows[used + n] = np.int32(corners[n])
-            new_corner_heights[used + n] = heights[n]
-        used += size
+            away = step_m * (first_row + height - corners[n])
+            if heights[n] - _least(lowest, curvature, step_m * corners[n]) > curvature * away * away:
+                new_corner_rows[used] = np.int32(corners[n])
+                new_corner_heights[used] = heights[n]
+                used += 1
         new_starts[k + 1] = used
         new_waiting[k] = met[height:]
-        _write_between(before, here, line - 1, wholes, rests, far)
+        if k > 0 or not joined:
+            _write_between(before, here, line - 1, wholes, rests, far)
         before, here = here, before
 
 

@@ -13,15 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 from xxhash import xxh3_128
 
-from schemas.manifest import Layer, Light, SampleType, digest
+from schemas.light import Light
+from schemas.manifest import Layer, SampleType, digest
 from schemas.region import Rect
 from tiler.checking.blockreader import BlockReader
+from tiler.light.directions import SunDirections, sun_directions
 from tiler.light.frame import Earth, SunPosition, sine_cosine_deg
-from tiler.light.heights import HeightGrid
+from tiler.light.ground import SunField
+from tiler.light.heights import HeightGrid, refined_layer
 from tiler.light.place import GridPlace
-from tiler.light.shading import shade_window
+from tiler.light.shading import shade_patch, shade_window
 from tiler.light.sweeping import Float32
-from tiler.light.visibility import TOP, hard_sun, make_shares, sky_shares, soft_sun, sun_slopes
+from tiler.light.visibility import TOP, Shares, SunSetting, make_shares, sky_shares, sun_shares, sun_slopes, whole_zone
+from tiler.light.zones import SunZones, sky_zones
 from tiler.rowfile import RowFile
 from tiler.sources import FileInfo, Pixels
 from tiler.sources.convert import Conversion
@@ -44,20 +48,35 @@ class Simulation:
         return SunPosition(self.light.grid_azimuth_deg, self.light.elevation_deg)
 
     @property
+    def field(self) -> SunField | None:
+        """Where the sun stands all over the map; None for a flat Earth, or if nothing says where on it the map is."""
+        place, light = self.place, self.light
+        if place.ground is None or place.longitude_deg is None or place.latitude_deg is None or light.radius_m is None:
+            return None
+        centre = place.longitude_deg, place.latitude_deg
+        return SunField(place.ground, centre, light.azimuth_deg, light.elevation_deg, refraction=light.refraction > 0)
+
+    @property
+    def directions(self) -> SunDirections | None:
+        """The sun's directions over a map that is too large for one."""
+        field, earth = self.field, self.earth
+        return None if field is None or earth is None else sun_directions(field, self.place, self.sun, earth)
+
+    @property
     def earth(self) -> Earth | None:
         """The round Earth, None for a flat one."""
         return None if self.light.radius_m is None else Earth(self.light.radius_m, self.light.refraction)
 
 
 class LightSource:
-    """The light on a stored height layer, a sample on every sample of its level 0, float32 from 0 to 1.
+    """The light on a stored height layer, on every sample of its level 0 and, at twice the density, between them; float32 from 0 to 1.
 
     ``bake`` must be called before samples are read. ``stages_s`` are the seconds that its parts took.
     """
 
     def __init__(self, reader: BlockReader, simulation: Simulation, dtype: SampleType, scratch: Path, workers: int) -> None:
         layer = reader.layer
-        self.info = _info(reader.name, layer)
+        self.info = height_info(reader.name, refined_layer(layer, simulation.light.density))
         self.conversion = Conversion("light", (0,), None, False, None, None, 1.0, 0.0, dtype)
         self.masked = layer.statistics.valid < layer.width * layer.height
         self.stages_s: dict[str, float] = {}
@@ -67,6 +86,7 @@ class LightSource:
         self._sun: RowFile | None = None
         self._sky: RowFile | None = None
         self._bounced = 0.0
+        self._directions: SunDirections | None = None
         self._on_stage: Callable[[str], None] = lambda name: None
 
     def bake(self, on_stage: Callable[[str], None] = lambda name: None) -> None:
@@ -77,14 +97,14 @@ class LightSource:
         light = self.simulation.light
         self._on_stage = on_stage
         with self._stage("heights"):
-            self._grid = HeightGrid(self._reader, self._scratch, self._workers)
+            self._grid = HeightGrid(self._reader, self._scratch, self._workers, light.density)
         with self._stage("sun"):
+            self._directions = self.simulation.directions
             self._sun = make_shares(self._grid, self._scratch)
             self._find_sun(self._grid, self._sun)
         if light.sky_azimuths:
             with self._stage("sky"):
-                place, earth = self.simulation.place, self.simulation.earth
-                self._sky = sky_shares(self._grid, place, light.sky_azimuths, earth, self._workers, self._scratch)
+                self._sky = self._find_sky(self._grid)
         if light.albedo:
             with self._stage("bounce"):
                 self._bounced = light.albedo * self._mean_light()
@@ -98,14 +118,22 @@ class LightSource:
 
     def _find_sun(self, grid: HeightGrid, shares: RowFile) -> None:
         simulation, light = self.simulation, self.simulation.light
-        match light.shadows:
-            case "none":
-                for window in _strips(grid.shape):
-                    shares.write(0, window.y0, np.full((window.height, window.width, 1), TOP, np.uint16))
-            case "soft":
-                soft_sun(grid, simulation.place, simulation.sun, light.radius_deg or 0.0, simulation.earth, shares)
-            case _:
-                hard_sun(grid, simulation.place, simulation.sun, simulation.earth, light.lines, shares)
+        if light.shadows == "none":
+            for window in _strips(grid.shape):
+                shares.write(0, window.y0, np.full((window.height, window.width, 1), TOP, np.uint16))
+            return
+        radius = (light.radius_deg or 0.0) if light.shadows == "soft" else None
+        setting = SunSetting(light.lines, radius, simulation.earth)
+        field, zones = simulation.field, None
+        if field is not None and simulation.earth is not None:
+            zones = SunZones(field, grid.range_m, simulation.earth, radius or 0.0).plan()
+        sun_shares(grid, zones or [whole_zone(grid, simulation.place, simulation.sun)], setting, self._workers, shares)
+
+    def _find_sky(self, grid: HeightGrid) -> RowFile:
+        simulation = self.simulation
+        field, earth = simulation.field, simulation.earth
+        zones = None if field is None or earth is None else sky_zones(field, grid.range_m, earth)
+        return sky_shares(grid, simulation.place, simulation.light.sky_azimuths, earth, self._workers, self._scratch, zones)
 
     def _mean_light(self) -> float:
         """Return the mean light of all valid samples before any is reflected, relative to the sun's."""
@@ -125,26 +153,34 @@ class LightSource:
 
     def _shaded(self, window: Rect) -> tuple[Float32, NDArray[np.bool_]]:
         """Return the light (h, w) of a window, and where there is any ground."""
-        grid, simulation = self._baked(), self.simulation
+        grid = self._baked()
         around = grid.read_around(window)
         shape = window.height, window.width
         lit = np.empty(shape, np.float32)
         sky = np.empty((window.height, 0), np.uint16) if self._sky is None else self._sky.read(window)[..., 0]
         assert self._sun is not None
-        east, north = sine_cosine_deg(simulation.light.grid_azimuth_deg)
-        shade_window(
-            around,
-            np.ascontiguousarray(simulation.place.cells_m[:, window.y0 : window.y1]),
-            east,
-            north,
-            sun_slopes(grid.shape, simulation.place.cell_m, simulation.sun, simulation.earth, window),
-            np.ascontiguousarray(self._sun.read(window)[..., 0]),
-            np.ascontiguousarray(sky),
-            simulation.light.sky_share,
-            self._bounced,
-            lit,
-        )
+        seen = np.ascontiguousarray(self._sun.read(window)[..., 0])
+        self._shade(around, window, seen, np.ascontiguousarray(sky), lit)
         return lit, ~np.isnan(around[1:-1, 1:-1])
+
+    def _shade(self, around: Float32, window: Rect, sun: Shares, sky: Shares, lit: Float32) -> None:
+        simulation = self.simulation
+        light, place = simulation.light, simulation.place
+        if self._directions is None:
+            east, north = sine_cosine_deg(light.grid_azimuth_deg)
+            slopes = sun_slopes(self._baked().shape, place.cell_m, simulation.sun, simulation.earth, window)
+            cells = np.ascontiguousarray(place.cells_m[:, window.y0 : window.y1])
+            shade_window(around, cells, east, north, slopes, sun, sky, light.sky_share, self._bounced, lit)
+            return
+        for patch in self._directions.patches(window):
+            part = patch.window.shifted(-window.x0, -window.y0)
+            rows, columns = slice(part.y0, part.y1), slice(part.x0, part.x1)
+            hidden = sky[rows, columns] if sky.shape[1] else sky[rows]
+            out = np.empty((part.height, part.width), np.float32)
+            near = np.ascontiguousarray(around[part.y0 : part.y1 + 2, part.x0 : part.x1 + 2])
+            seen, hidden = np.ascontiguousarray(sun[rows, columns]), np.ascontiguousarray(hidden)
+            shade_patch(near, patch.corners, patch.place, seen, hidden, light.sky_share, self._bounced, out)
+            lit[rows, columns] = out
 
     def read(self, window: Rect) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """Return light (rows, columns, 1) and coverage (rows, columns), None unless ``masked``."""
@@ -179,7 +215,8 @@ def _strips(shape: tuple[int, int]) -> Iterator[Rect]:
         yield Rect(0, y, shape[1], min(shape[0], y + _STRIP_ROWS))
 
 
-def _info(name: str, layer: Layer) -> FileInfo:
+def height_info(name: str, layer: Layer) -> FileInfo:
+    """Return what a layer of heights is as a source: one of floats, of any window."""
     return FileInfo(
         path=Path(name),
         format="clipmap",

@@ -14,8 +14,10 @@ from geographiclib.geodesic import Geodesic
 
 from schemas.errors import InputError, UsageError
 from schemas.manifest import Layer, Transform, World
+from schemas.region import Rect
 from tiler.geodesy import geographic_places, ground_spacing_m
 from tiler.light.frame import SunPosition
+from tiler.light.ground import Ground
 from tiler.light.sweeping import Float64
 
 _NODES: Final = 257
@@ -30,7 +32,7 @@ class GridPlace:
 
     ``up_deg`` is the azimuth [degrees, clockwise from true north] of the direction of decreasing rows; ``handed`` is -1 for a grid that
     lies mirrored, rows from south to north. ``longitude_deg`` and ``latitude_deg`` of the centre are None if nothing says where on the
-    Earth it is.
+    Earth it is; ``ground`` tells directions and distances everywhere, those above are the centre's.
     """
 
     cells_m: Float64
@@ -39,10 +41,22 @@ class GridPlace:
     handed: int
     longitude_deg: float | None
     latitude_deg: float | None
+    ground: Ground | None = None
 
     def on_grid(self, azimuth_deg: float, elevation_deg: float) -> SunPosition:
         """Return where the sun stands as seen from the grid, given its azimuth from true north [degrees]."""
         return SunPosition(self.handed * (azimuth_deg - self.up_deg) % 360.0, elevation_deg)
+
+    def cells_in(self, window: Rect) -> Float64:
+        """Return the distances (2, rows) [m] in a ``window``: those of the whole if it is as wide, else along its own central column."""
+        if self.ground is None or window.width >= self.ground.shape[1]:
+            return self.cells_m[:, window.y0 : window.y1]
+        rows = np.arange(window.y0, window.y1, dtype=np.float64)
+        nodes = np.unique(np.linspace(window.y0, window.y1 - 1, min(33, window.height)).round())
+        steps = self.ground.steps(nodes, np.full(nodes.size, (window.x0 + window.x1 - 1) / 2))
+        if steps is None:
+            return self.cells_m[:, window.y0 : window.y1]
+        return np.stack([np.interp(rows, nodes, np.hypot(*each)) for each in (steps.right_m, steps.up_m)])
 
 
 def place_of(layer: Layer, world: World, where: str) -> GridPlace:
@@ -64,7 +78,8 @@ def place_of(layer: Layer, world: World, where: str) -> GridPlace:
         raise InputError(f"{where}: its rows and columns are {abs(turn):.1f} degrees apart; bring the heights onto a square grid first")
     middle = cells[:, layer.height // 2]
     longitude, latitude = centre or (None, None)
-    return GridPlace(cells, (float(middle[0]), float(middle[1])), up, 1 if turn > 0 else -1, longitude, latitude)
+    ground = None if world.crs is None else Ground((layer.height, layer.width), layer.transform, world.crs)
+    return GridPlace(cells, (float(middle[0]), float(middle[1])), up, 1 if turn > 0 else -1, longitude, latitude, ground)
 
 
 def _plane_directions(transform: Transform) -> tuple[float, float]:
@@ -80,10 +95,12 @@ def _directions(transform: Transform, crs: str, column: float, row: float, where
     if found is None:
         raise UsageError(f"{where}: the centre of the layer is no place on the Earth in {crs}")
     longitudes, latitudes = found
-    up, right = (
-        Geodesic.WGS84.Inverse(latitudes[i], longitudes[i], latitudes[i + 1], longitudes[i + 1], Geodesic.AZIMUTH)["azi1"] for i in (0, 2)
-    )
-    return float(up) % 360.0, float(right) % 360.0, (longitudes[4], latitudes[4])
+    # From the centre itself, to both sides: at a pole every other place lies on a meridian of its own, and has another north.
+    sides = [
+        float(Geodesic.WGS84.Inverse(latitudes[4], longitudes[4], latitudes[i], longitudes[i], Geodesic.AZIMUTH)["azi1"]) for i in range(4)
+    ]
+    up, right = (ahead + ((back + 180.0 - ahead + 180.0) % 360.0 - 180.0) / 2 for back, ahead in (sides[:2], sides[2:]))
+    return up % 360.0, right % 360.0, (longitudes[4], latitudes[4])
 
 
 def _cells_m(layer: Layer, crs: str) -> Float64:

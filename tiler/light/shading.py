@@ -55,8 +55,8 @@ def shade_window(
 
     ``around`` (h + 2, w + 2) are its heights [m] and those around it, ``cells_m`` (2, h) the distances between them, ``east`` and ``north``
     the sun's direction on the grid, ``slopes`` the tangent of its elevation as ``sun_slopes`` gives it, infinite at the zenith. ``sun``
-    (h, w) and ``sky`` (h, w or 0) are the shares that are seen, of 65535. ``open_sky`` is the light of the whole sky, ``bounced`` that
-    of ground that fills it, both relative to the sun's.
+    (h, w) and ``sky`` (h, w or 0) are the shares that are seen, of 65535; without a ``sky`` only the sample's own slope hides any.
+    ``open_sky`` is the light of the whole sky, ``bounced`` that of ground that fills it, both relative to the sun's.
     """
     height, width = out.shape
     top = 1.0 / 65535.0
@@ -80,6 +80,54 @@ def shade_window(
             if has_sky:
                 seen = sky[y, x] * top
                 light += open_sky * seen + bounced * (1.0 - seen)
+            else:
+                light += open_sky * 0.5 * (1.0 + upright)
+            out[y, x] = np.float32(light / (1.0 + open_sky))
+
+
+@compiled
+def shade_patch(
+    around: Float32,
+    corners: Float64,
+    place: Float64,
+    sun: NDArray[np.uint16],
+    sky: NDArray[np.uint16],
+    open_sky: float,
+    bounced: float,
+    out: Float32,
+) -> None:
+    """Set ``out`` (h, w) to the light of a part of a map over which the sun's direction changes; else as ``shade_window``.
+
+    ``corners`` (5, 2, 2) are, at the four nodes around it, the sun's unit vector on the grid (right, upward, vertical) and the distances
+    between samples along a row and along a column; ``place`` the row and column of the first sample, from the first node, and the rows and
+    columns from node to node. What is between nodes is interpolated.
+    """
+    height, width = out.shape
+    top = 1.0 / 65535.0
+    has_sky = sky.shape[1] == width
+    left, right_end = np.empty(5, np.float64), np.empty(5, np.float64)
+    for y in range(height):
+        down = (place[0] + y) / place[2]
+        for n in range(5):
+            left[n] = corners[n, 0, 0] + down * (corners[n, 1, 0] - corners[n, 0, 0])
+            right_end[n] = corners[n, 0, 1] + down * (corners[n, 1, 1] - corners[n, 0, 1]) - left[n]
+        for x in range(width):
+            here = around[y + 1, x + 1]
+            if math.isnan(here):
+                out[y, x] = np.float32(0)
+                continue
+            aside = (place[1] + x) / place[3]
+            cell_x, cell_y = left[3] + aside * right_end[3], left[4] + aside * right_end[4]
+            right, up = gradient(around, y, x, cell_x, cell_y)
+            upright = 1.0 / math.sqrt(1.0 + (right * right + up * up))
+            east, north = left[0] + aside * right_end[0], left[1] + aside * right_end[1]
+            facing = upright * (left[2] + aside * right_end[2] - (right * east + up * north))
+            light = max(facing, 0.0) * sun[y, x] * top
+            if has_sky:
+                seen = sky[y, x] * top
+                light += open_sky * seen + bounced * (1.0 - seen)
+            else:
+                light += open_sky * 0.5 * (1.0 + upright)
             out[y, x] = np.float32(light / (1.0 + open_sky))
 
 
@@ -88,8 +136,8 @@ def add_sky(around: Float32, cells_m: Float64, tangents: Float32, east: float, n
     """Add to ``shares`` (h, w) what is seen of the sky in one direction on the grid, in units of 2**-20.
 
     The share is cos(S) (sin(H)**2 - g (H - sin(H) cos(H))), with S the slope, g the rise per metre in the direction, H the angle from the
-    zenith to the horizon or, if that is nearer, to the sample's own plane (Dozier and Frew 1990, eq. 7b). Whole numbers, so that the
-    order in which directions are added does not matter.
+    zenith to the horizon, to the sample's own plane or to the horizontal, whichever is nearest (Dozier and Frew 1990, eq. 7b): directions
+    below the horizontal are no sky, whatever is seen there. Whole numbers, so that the order in which directions are added does not matter.
     """
     height, width = shares.shape
     for y in range(height):
@@ -100,7 +148,7 @@ def add_sky(around: Float32, cells_m: Float64, tangents: Float32, east: float, n
                 continue
             right, up = gradient(around, y, x, cell_x, cell_y)
             own = right * east + up * north
-            tangent = max(float(tangents[y, x]), own)
+            tangent = max(float(tangents[y, x]), own, 0.0)
             angle = 0.5 * math.pi - math.atan(tangent)
             sine_squared = 1.0 / (1.0 + tangent * tangent)
             seen = (sine_squared - own * (angle - tangent * sine_squared)) / math.sqrt(1.0 + (right * right + up * up))

@@ -37,3 +37,12 @@ def refracted_deg(elevation_deg: float) -> float:
     seen = max(elevation_deg, -1.0)
     lift = 1.02 / 60 / math.tan(math.radians(seen + 10.3 / (seen + 5.11)))
     return min(elevation_deg + max(lift, 0.0), 90.0)
+
+
+def unrefracted_deg(seen_deg: float) -> float:
+    """Return the elevation [degrees] at which a body stands that is seen at ``seen_deg``: the inverse of ``refracted_deg``, to 1e-12."""
+    low, high = seen_deg - 1.0, seen_deg
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if refracted_deg(middle) < seen_deg else (low, middle)
+    return high

@@ -212,7 +212,7 @@ class Cutter:
 
 
 def _completed(samples: Samples, mask: Mask | None, seen: Rect, whole: Rect, block: BlockFormat) -> tuple[Samples, Mask | None]:
-    """Fill what of ``whole`` lies outside its level by repeating the edge, never black; transparent if there is alpha, void for heights.
+    """Fill what of ``whole`` lies outside its level by repeating the edge, never black; transparent if there is alpha, void for floats.
 
     Void padding is what a client must see (there is no ground), and it costs nothing: coded as ground, the repeated last row of a
     1025 x 1025 terrain takes as many bytes as a full block.
@@ -223,6 +223,6 @@ def _completed(samples: Samples, mask: Mask | None, seen: Rect, whole: Rect, blo
     completed = np.pad(samples, (*missing, (0, 0)), mode="edge")
     if block.alpha:
         completed[..., -1] = np.pad(samples[..., -1], missing)
-    if block.kind == "height":
+    if block.dtype == "float32":
         mask = np.pad(np.ones(samples.shape[:2], np.bool_) if mask is None else mask, missing)
     return completed, mask

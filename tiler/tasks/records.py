@@ -17,8 +17,9 @@ from pydantic import Field, JsonValue, ValidationError
 from schemas.address import BlockAddress
 from schemas.blockindex import RECORD_BYTES, BlockIndex, BlockRecord, pack_record
 from schemas.errors import NotFoundError
-from schemas.manifest import Digest, Model, digest
-from schemas.settings import BuildSettings, LightSettings
+from schemas.manifest import Digest, digest
+from schemas.model import Model
+from schemas.settings import BuildSettings, LightSettings, NormalSettings
 from tiler.sources import Layout
 from tiler.stores import Store
 from tiler.tasks.cut import CutBlock
@@ -47,6 +48,7 @@ class PlanRecord(Model):
     stamps: list[str] = Field(description="State of every source file: path, size and time of change; empty while an update is published")
     settings: BuildSettings
     light: LightSettings | None = Field(default=None, description="What light is simulated, if the layer is one of light")
+    normals: NormalSettings | None = Field(default=None, description="What normals are found, if the layer is one of normals")
     ranges: list[tuple[float, float]] = Field(default=[], description="What a stretch found to become 0 to 255, per channel")
 
     def explain(self, signature: dict[str, JsonValue], ignored: Collection[str] = ()) -> str:

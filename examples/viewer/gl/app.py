@@ -112,6 +112,7 @@ class App:
         self._titled_at, self._frames = time.perf_counter(), 0
         self._motions = self._key_map(window.keys)
         self._closing = False
+        self._drawn: dict[str, bool] = {}
         # The library's own exit key closes the window in the midst of its events, which pyglet does not always survive.
         window.exit_key = None
         window.key_event_func = self.on_key
@@ -144,6 +145,7 @@ class App:
         target.clear(depth=1.0)
         self._renderer.draw(frame, wireframe=self.wireframe, tint=self.tint)
         self._context.gc()
+        self._tell_effects(frame)
         self._show_numbers(frame)
         return frame
 
@@ -170,6 +172,13 @@ class App:
         """Take a drag of the mouse."""
         self.flight.look(right_px, down_px, self.window.height)
 
+    def _tell_effects(self, frame: Frame) -> None:
+        """Say which effects are drawn and why, first and whenever one begins or ends."""
+        for effect in frame.effects.all:
+            if self._drawn.get(effect.name) != effect.runs:
+                self._say(f"{effect.name} {effect.text}")
+                self._drawn[effect.name] = effect.runs
+
     def _show_numbers(self, frame: Frame) -> None:
         self._frames += 1
         now = time.perf_counter()
@@ -181,6 +190,7 @@ class App:
             f"{self._frames / (now - self._titled_at):.0f} fps",
             f"{loader.counts.blocks} blocks, {loader.pending} to come",
             f"level {frame.active}",
+            *(f"{effect.name} up to {effect.bound:.3g} {effect.unit}" for effect in frame.effects.all if effect.runs),
         ]
         if self.frozen is not None:
             parts.append("frozen")

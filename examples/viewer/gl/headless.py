@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from schemas.errors import StorageError, UsageError
 from viewer.camera import Camera
+from viewer.effects import ViewEffects
 from viewer.frames import Frame, FrameMaker
 from viewer.framing import focus, orbit
 from viewer.gl.context import check_errors, headless_context, renderer_name
@@ -39,6 +40,8 @@ class Picture:
     triangles: int
     draw_s: float
     load_s: float
+    effects: ViewEffects
+    """What was drawn of haze and curvature, and why."""
 
 
 class Offscreen:
@@ -140,7 +143,7 @@ def render_frames(view: HeadlessView, scene: Scene, camera: Camera, paths: list[
         triangles = view.draw(frame)
         drawn = time.perf_counter()
         write_png(path, view.target.pixels())
-        yield Picture(path, placed, triangles, draw_s=drawn - loaded, load_s=loaded - begun)
+        yield Picture(path, placed, triangles, draw_s=drawn - loaded, load_s=loaded - begun, effects=frame.effects)
 
 
 def write_png(path: Path, pixels: Pixels) -> None:

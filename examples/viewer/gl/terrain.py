@@ -7,6 +7,7 @@ from typing import Final
 import moderngl
 import numpy as np
 
+from viewer.decode import NORMAL_ZERO
 from viewer.drawplan import GEOMETRY_LEVEL, MAX_LEVELS, TEXTURE_LEVEL
 from viewer.footprint import Shape, meshes
 from viewer.frames import Frame
@@ -23,15 +24,20 @@ _GEOMETRY_BINDING, _TEXTURE_BINDING = 0, 1
 _SURFACE_UNIT, _SLOPES_UNIT, _IMAGERY_UNIT = 0, 1, 2
 
 
-def terrain_defines(options: ViewOptions, texture_levels: int, *, bare_ground: bool = True) -> dict[str, str | int | float]:
+def terrain_defines(
+    options: ViewOptions, texture_levels: int, *, bare_ground: bool = True, normals: bool = False
+) -> dict[str, str | int | float]:
     """Return the constants compiled into the terrain's shaders.
 
-    ``texture_levels`` is 0 without imagery; ``bare_ground`` says that ground is drawn where imagery is transparent.
+    ``texture_levels`` is 0 without imagery; ``bare_ground`` says that ground is drawn where imagery is transparent; ``normals`` that
+    texels are normals.
     """
     return {
         "MAX_LEVELS": MAX_LEVELS,
         "SIDE": options.grid + 1,
         "IMAGERY": int(texture_levels > 0),
+        "NORMALS": int(normals),
+        "NORMAL_ZERO": float(NORMAL_ZERO),
         "BARE_GROUND": int(bare_ground or not texture_levels),
         "TEXTURE_LEVELS": max(1, texture_levels),
         "TEXTURE_SIDE": float(options.texture_window),
@@ -76,7 +82,8 @@ class TerrainRenderer:
         texture_levels = 0 if scene.imagery is None else scene.imagery.pyramid.levels
         self.heights = TextureStack(context, options.grid + 1, scene.heights.levels, HEIGHT_PLANES)
         self.imagery: TextureStack | None = None
-        defines = terrain_defines(options, texture_levels, bare_ground=scene.has_heights)
+        normals = scene.imagery is not None and scene.imagery.layer.normals is not None
+        defines = terrain_defines(options, texture_levels, bare_ground=scene.has_heights or normals, normals=normals)
         fragment = ["levels.glsl", "surface.glsl", "morph.glsl", "terrain.frag"]
         if texture_levels:
             self.imagery = TextureStack(context, options.texture_window, texture_levels, IMAGE_PLANES)
@@ -112,10 +119,11 @@ class TerrainRenderer:
             "u_sun": sun_vector(options.sun_deg or (0.0, 90.0)),
             "u_ambient": 1.0 if options.sun_deg is None else AMBIENT,
             "u_height_range": scene.z_range_m,
-            "u_haze": 0.0 if options.haze_m is None else 1.0 / options.haze_m,
         }
         if scene.imagery is not None:
             constants["u_to_texels"] = _column_major(scene.imagery.to_texels.linear)
+            if scene.imagery.layer.normals is not None:
+                constants["u_facing"] = _column_major(scene.imagery.facing(scene.frame))
         return constants
 
     def draw(self, frame: Frame, *, wireframe: bool = False, tint: bool = False, sky: bool = True) -> int:
@@ -135,6 +143,8 @@ class TerrainRenderer:
                 "u_ground_edge": frame.ground_edge,
                 "u_image_edge": frame.image_edge,
                 "u_level_tint": float(tint),
+                "u_haze": frame.effects.extinction_per_m,
+                "u_sag": frame.effects.sag_per_m,
             },
         )
         triangles = sum(self._meshes[shape].draw(instances.tobytes()) for shape, instances in frame.geometry.instances.items())

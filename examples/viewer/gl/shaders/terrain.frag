@@ -17,6 +17,9 @@ uniform vec4 u_ground_edge;  // the edge of the heights relative to the viewer, 
 uniform mat2 u_to_texels;    // level-0 height samples to level-0 texels
 uniform vec4 u_image_edge;   // the imagery's edge relative to the viewer, level-0 texels
 #endif
+#if NORMALS
+uniform mat2 u_facing;       // x and y of stored normals to east and north
+#endif
 
 out vec4 f_colour;
 
@@ -62,6 +65,14 @@ float light_on(vec3 normal) {
     return u_ambient + (1.0 - u_ambient) * min(direct, 2.0);
 }
 
+#if NORMALS
+// A stored normal; what is exaggerated is steeper.
+vec3 stored_normal(vec4 texel) {
+    vec2 n = 255.0 * texel.rg / (texel.a * NORMAL_ZERO) - 1.0;
+    return normalize(vec3(u_facing * n * u_exaggeration, sqrt(max(1.0 - dot(n, n), 1e-4))));
+}
+#endif
+
 bool is_within(vec2 p, vec4 edge) {
     return all(greaterThanEqual(p, edge.xy)) && all(lessThanEqual(p, edge.zw));
 }
@@ -75,7 +86,9 @@ void main() {
     float pixel = sqrt(max(dot(across, across), dot(down, down)));
     vec4 image = clipmap_texel(texel, pixel);
     bool on_image = is_within(texel, u_image_edge);
-#if BARE_GROUND
+#if NORMALS
+    normal = on_image && image.a > 0.0 ? stored_normal(image) : normal;
+#elif BARE_GROUND
     colour = on_image ? colour * (1.0 - image.a) + image.rgb : colour;  // image.rgb is premultiplied
 #else
     bool void_image = !on_image || image.a < 0.5;
@@ -93,7 +106,9 @@ void main() {
 #endif
     // Light is added in linear space. Texels are interpolated as they are stored: moderngl makes no arrays of sRGB textures.
     vec3 linear = to_linear(colour) * light_on(normal);
-    linear = mix(to_linear(HORIZON), linear, exp(-u_haze * length(v_position)));
+    if (u_haze > 0.0) {
+        linear = mix(to_linear(HORIZON), linear, exp(-u_haze * length(v_position)));
+    }
     vec3 shown = to_srgb(clamp(linear, 0.0, 1.0));
     vec3 tint = LEVELS[v_level - 6 * (v_level / 6)];
     f_colour = vec4(mix(shown, tint * (0.35 + 0.65 * light_on(normal)), 0.6 * u_level_tint), 1.0);

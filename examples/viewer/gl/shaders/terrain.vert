@@ -7,6 +7,7 @@ uniform mat2 u_to_metres;    // level-0 samples to metres east and north
 uniform vec2 u_fraction;     // the viewer within its level-0 cell
 uniform float u_exaggeration;
 uniform vec3 u_origin;       // where the clipmap's centre is at height 0, metres from the camera
+uniform float u_sag;         // by which ground at distance d sinks, times d squared, 1 per metre; 0 means a flat map
 
 out vec2 v_cell;      // grid units of the level
 out vec2 v_relative;  // level-0 samples from the viewer
@@ -22,6 +23,7 @@ void main() {
     // Exact integers first and one rounding last: vertices that two levels share come out bit-identical.
     v_relative = vec2(cell * level.place.z + level.place.xy) - u_fraction;
     v_position = vec3(u_to_metres * v_relative, v_surface.x * u_exaggeration) + u_origin;
+    v_position.z -= u_sag * dot(v_position.xy, v_position.xy);
     v_cell = vec2(cell);
     v_level = in_patch.z;
     gl_Position = u_view_projection * vec4(v_position, 1.0);
