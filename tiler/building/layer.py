@@ -53,7 +53,7 @@ class LayerBuild:
         # The records of another partition would be of no use, and blocks do not depend on it.
         self.plan = plan if intent.record is None else replace(plan, partition=intent.record.partition)
         self._intent, self._sources, self._store, self._claim = intent, sources, store, claim
-        self._dataset, self._stamps, self._settings, self._engine = dataset, stamps, settings, engine
+        self._dataset, self._stamps, self._settings, self.engine = dataset, stamps, settings, engine
         self._book = RecordBook(store, intent.tasks_path)
         self._is_update = intent.act == "update"
         self._is_continued = intent.path in claim.abandoned
@@ -104,13 +104,13 @@ class LayerBuild:
         RecordBook(self._store, intent.path).write_plan(record)
         ledger = Ledger(plan.lattice, plan.source.conversion.channels)
         published = Dataset(self._store, self._dataset) if self._is_update and self._dataset is not None else None
-        target = make_target(plan, self._store, intent.path, published)
+        target = replace(make_target(plan, self._store, intent.path, published), unnamed=True)
         worker = TaskWorker(plan, target, self._book, self._stamps, _Counter(plan, on_progress).add, self._job(record))
         pieces: dict[Task, str] = {}
         for tier in plan.tiers:
             handed_on: dict[Task, str] = {}
             # Closed however the loop ends, so that no task is under way any more when what is kept is counted.
-            with closing(self._engine.run(worker, self._works(worker, tier, pieces))) as finished:
+            with closing(self.engine.run(worker, self._works(worker, tier, pieces))) as finished:
                 for done in finished:
                     self._note(done, ledger)
                     self._look_at_source()
