@@ -114,9 +114,7 @@ def test_a_bake_is_light_by_brute_force(case: Case, soft: bool) -> None:
     assert np.abs(codes - light)[clear | (soft & (case.elevation < 80))].max(initial=0.0) < 0.05
 
 
-@pytest.mark.xfail(
-    strict=False, reason="2026-11-23: a shadow bound of 0 with 0.026 codes of change beside it, on a knife edge; to be mended"
-)
+@pytest.mark.xfail(strict=False, reason="2026-11-23: a shadow bound of 0 with 0.026 codes of change beside it, on a knife edge; to be mended")
 @settings(max_examples=150)
 @given(
     case=cases(largest=9),

@@ -139,8 +139,7 @@ def report_of(build: LayerBuild, intent: Intent, claim: Claim, wall_s: float) ->
         times=build.times,
         wall_s=wall_s,
         megasamples=plan.lattice.width * plan.lattice.height / 1e6,
-        # Of processes on this machine, if the engine has any.
-        peak_rss_bytes=peak_bytes() + getattr(build.engine, "peak_bytes", 0),
+        peak_rss_bytes=peak_bytes() + build.processes_bytes,
         tasks=plan.task_count,
         tasks_kept=build.kept,
         blocks_written=build.written,

@@ -53,7 +53,7 @@ class LayerBuild:
         # The records of another partition would be of no use, and blocks do not depend on it.
         self.plan = plan if intent.record is None else replace(plan, partition=intent.record.partition)
         self._intent, self._sources, self._store, self._claim = intent, sources, store, claim
-        self._dataset, self._stamps, self._settings, self.engine = dataset, stamps, settings, engine
+        self._dataset, self._stamps, self._settings, self._engine = dataset, stamps, settings, engine
         self._book = RecordBook(store, intent.tasks_path)
         self._is_update = intent.act == "update"
         self._is_continued = intent.path in claim.abandoned
@@ -81,6 +81,11 @@ class LayerBuild:
         if not self._settings.records:
             self._book.delete()
         self._claim.announce(*intent.kept)
+
+    @property
+    def processes_bytes(self) -> int:
+        """What processes of this machine in which tasks ran held at most, besides what they shared with this one [bytes]."""
+        return int(getattr(self._engine, "peak_bytes", 0))
 
     @contextmanager
     def _kept_on_failure(self) -> Iterator[None]:
@@ -110,7 +115,7 @@ class LayerBuild:
         for tier in plan.tiers:
             handed_on: dict[Task, str] = {}
             # Closed however the loop ends, so that no task is under way any more when what is kept is counted.
-            with closing(self.engine.run(worker, self._works(worker, tier, pieces))) as finished:
+            with closing(self._engine.run(worker, self._works(worker, tier, pieces))) as finished:
                 for done in finished:
                     self._note(done, ledger)
                     self._look_at_source()

@@ -1,4 +1,4 @@
-"""A store in a directory: one file per key, written to a temporary name and renamed."""
+"""A store in a directory: one file per key, written to a temporary name and renamed, but for what nothing names yet."""
 
 import ctypes
 import os

@@ -11,15 +11,16 @@ import pickle
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, islice
 from multiprocessing.connection import Connection, Pipe, wait
 from time import monotonic, sleep
 from typing import Any, Final, NoReturn
 
-from schemas.errors import StorageError
+from schemas.errors import ClipmapError, StorageError
 from tiler.tasks.engine import run_tasks
 from tiler.tasks.memory import own_peak_bytes
 from tiler.tasks.worker import Done, TaskWorker, Work
@@ -118,8 +119,7 @@ class _Crew:
         # Blocked, or an interrupt could be the copy's before it has learned to leave that to us, or find a process that nobody notes.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _PARENTS_BUSINESS)
         try:
-            with _untouched():
-                process = os.fork()
+            process = _forked()
             if process == 0:
                 # Of the others too: as long as anybody holds the other end, nobody learns that we have died.
                 held = [ours, *(hand.connection for hand in self._hands)]
@@ -193,8 +193,10 @@ class _Crew:
                 self._wait_for(hand)
         except BaseException:
             for hand in self._hands:
-                os.kill(hand.process, signal.SIGKILL)
-                os.waitpid(hand.process, 0)
+                with suppress(ProcessLookupError, ChildProcessError):  # it has ended, and that was noted
+                    os.kill(hand.process, signal.SIGKILL)
+                    os.waitpid(hand.process, 0)
+                hand.connection.close()
             raise
 
     def _wait_for(self, hand: _Hand) -> None:
@@ -209,21 +211,26 @@ class _Crew:
         hand.connection.close()
 
 
-@contextmanager
-def _untouched() -> Iterator[None]:
-    """Keep Python from looking for garbage among the objects there are: looking writes to them, and what is written is copied."""
+def _forked() -> int:
+    """Copy this process; what there is of Python's objects is not looked at for garbage in the copy.
+
+    Looking writes to them, and what one of two processes writes to is copied. Returns what ``os.fork`` does; raises OSError.
+    """
+    frozen = gc.get_freeze_count()
     gc.freeze()
+    process = -1
     try:
-        yield
+        process = os.fork()
     finally:
-        gc.unfreeze()
+        if process and not frozen:
+            gc.unfreeze()
+    return process
 
 
 def _be_a_hand(worker: TaskWorker, connection: Connection, held: list[Connection]) -> NoReturn:
     """Do in a new process what it is for, and end it; what the process that it comes from had still to do is not for it."""
     status = 1
     with suppress(BaseException):
-        gc.freeze()
         die_with_parent = ctypes.CDLL(None).prctl
         die_with_parent(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
         for each in held:
@@ -255,10 +262,12 @@ def _outcome(worker: TaskWorker, work: Work) -> Done | _Failed:
     try:
         return worker(work)
     except BaseException as error:
+        if not isinstance(error, ClipmapError):  # a mistake of ours: where it was made would be lost on the way
+            error.add_note("".join(traceback.format_exception(error)))
         try:
             pickle.loads(pickle.dumps(error))
         except Exception:  # one that cannot be sent; what it says can
-            return _Failed(RuntimeError(f"{type(error).__name__}: {error}"))
+            return _Failed(RuntimeError("".join(traceback.format_exception(error))))
         return _Failed(error)
 
 
