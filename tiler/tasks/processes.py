@@ -21,6 +21,7 @@ from time import monotonic, sleep
 from typing import Any, Final, NoReturn
 
 from schemas.errors import ClipmapError, StorageError
+from tiler.sources.geo import share_cache
 from tiler.tasks.engine import run_tasks
 from tiler.tasks.memory import own_peak_bytes
 from tiler.tasks.worker import Done, TaskWorker, Work
@@ -87,7 +88,7 @@ class ProcessEngine:
             yield from run_tasks(worker, works, self._workers)
             return
         worker.warm()
-        crew = _Crew(worker)
+        crew = _Crew(worker, len(first))
         try:
             hired = sum(crew.hire() for _ in first)
             yield from crew.run(works) if hired else run_tasks(worker, works, self._workers)
@@ -108,8 +109,8 @@ class _Hand:
 class _Crew:
     """The processes of one run."""
 
-    def __init__(self, worker: TaskWorker) -> None:
-        self._worker = worker
+    def __init__(self, worker: TaskWorker, size: int) -> None:
+        self._worker, self._size = worker, size
         self._hands: list[_Hand] = []
         self.peak_bytes = 0
 
@@ -123,7 +124,7 @@ class _Crew:
             if process == 0:
                 # Of the others too: as long as anybody holds the other end, nobody learns that we have died.
                 held = [ours, *(hand.connection for hand in self._hands)]
-                _be_a_hand(self._worker, theirs, held)
+                _be_a_hand(self._worker, theirs, held, self._size)
             self._hands.append(_Hand(process, ours))
         except OSError:  # too many processes, or too little memory
             ours.close()
@@ -227,8 +228,8 @@ def _forked() -> int:
     return process
 
 
-def _be_a_hand(worker: TaskWorker, connection: Connection, held: list[Connection]) -> NoReturn:
-    """Do in a new process what it is for, and end it; what the process that it comes from had still to do is not for it."""
+def _be_a_hand(worker: TaskWorker, connection: Connection, held: list[Connection], size: int) -> NoReturn:
+    """Do in a new process what it is for, one of ``size``, and end it; what the one it comes from had still to do is not for it."""
     status = 1
     with suppress(BaseException):
         die_with_parent = ctypes.CDLL(None).prctl
@@ -238,6 +239,7 @@ def _be_a_hand(worker: TaskWorker, connection: Connection, held: list[Connection
         for number in _PARENTS_BUSINESS:
             signal.signal(number, signal.SIG_IGN)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _PARENTS_BUSINESS)
+        share_cache(size)
         # On a thread of its own: sources have a handle of each file per thread, and those of the first one are shared with others.
         thread = threading.Thread(target=_work, args=(worker, connection))
         thread.start()
