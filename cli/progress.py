@@ -3,6 +3,10 @@
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from time import monotonic
+from typing import Final
+
+_DRAW_EVERY_S: Final = 0.1
 
 
 @contextmanager
@@ -15,10 +19,15 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    # Drawn when there is something new: a thread that draws it anew all the time would keep builds from using processes.
+    with Progress(*columns, console=Console(stderr=True), transient=True, auto_refresh=False) as bar:
         task = bar.add_task(what, total=None)
+        drawn_s = -_DRAW_EVERY_S
 
         def update(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total)
+            nonlocal drawn_s
+            due = monotonic() - drawn_s >= _DRAW_EVERY_S
+            drawn_s = monotonic() if due else drawn_s
+            bar.update(task, completed=done, total=total, refresh=due)
 
         yield update

@@ -23,6 +23,7 @@ import llvmlite
 import numba
 from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
+from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 from numba.core.types import Dispatcher
 from numba.extending import typeof_impl
@@ -55,7 +56,8 @@ class KernelCache(NullCache):  # type: ignore[misc]  # numba has no types
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:  # noqa: ANN401
         """Return the code for arguments of the types ``sig``; None if there is none on disk that is of use."""
-        target_context.refresh()
+        # Memory for kernels that allocate. What else numba loads here is for compiling, which sees to it: 130 ms.
+        rtsys.initialize(target_context)
         name = self._name(sig, target_context.codegen())
         for folder in self._folders:
             # A file can be unreadable in more ways than can be listed, and every one of them has the same cure.

@@ -77,7 +77,7 @@ if TYPE_CHECKING:
 @click.option("--break-lock", is_flag=True, help="Take over the lock of a build in an object store that gives no sign of life.")
 @click.option("--engine", type=click.Choice(["local", "dask"]), default="local", show_default=True, help="Where tasks run.")
 @click.option("--scheduler", metavar="tcp://HOST:PORT", help="Scheduler of the Dask cluster that tasks run on.")
-@click.option("--workers", type=int, help="Threads; no effect on the result.  [default: all processors]")
+@click.option("--workers", type=int, help="Tasks at a time; no effect on the result.  [default: all processors]")
 @click.option("--task", type=int, help="Side of a task in samples; no effect on the result.  [default: 4096, or 2048 for small sources]")
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
 def command(

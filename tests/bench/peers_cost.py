@@ -10,6 +10,8 @@ from typing import Final
 
 PERIOD_S: Final = 0.03
 """Between two looks at the memory of a run."""
+SHARED_EVERY: Final = 6
+"""So many looks apart, what several processes hold: the kernel goes through all their pages for it, which takes a millisecond each."""
 
 
 class CommandError(Exception):
@@ -20,9 +22,9 @@ class CommandError(Exception):
 class Cost:
     """One run: ``wall_s`` of the whole command, ``cpu_s`` of all its processes, ``flush_s`` until the disk had its output.
 
-    ``peak_rss_bytes`` sums the peaks of the processes that live at the same time, so pages which two of them share count
-    twice. ``other_cpu_s`` is what everything else on the machine used meanwhile; ``record_bytes`` is the part of
-    ``output_bytes`` that clipmap keeps for updates and repairs.
+    ``peak_rss_bytes`` is the peak of a process that stays alone, else the largest sum seen of what processes hold at the same time,
+    each page shared by n of them counted as 1/n for each. ``other_cpu_s`` is what everything else on the machine used meanwhile;
+    ``record_bytes`` is the part of ``output_bytes`` that clipmap keeps for updates and repairs.
     """
 
     wall_s: float
@@ -44,12 +46,19 @@ def _family(process: int) -> list[int]:
     return [process, *(member for child in children for member in _family(int(child)))]
 
 
-def _peak_bytes(process: int) -> int:
+def _noted_bytes(process: int, file: str, name: str) -> int:
     try:
-        status = Path(f"/proc/{process}/status").read_text()
+        status = Path(f"/proc/{process}/{file}").read_text()
     except (FileNotFoundError, ProcessLookupError):
         return 0
-    return next((1024 * int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")), 0)
+    return next((1024 * int(line.split()[1]) for line in status.splitlines() if line.startswith(name)), 0)
+
+
+def _held_bytes(processes: list[int], look: int) -> int:
+    """Return what processes hold: of one its peak, of several their shares, at every few looks; 0 if not known."""
+    if len(processes) == 1:
+        return _noted_bytes(processes[0], "status", "VmHWM:")
+    return 0 if look % SHARED_EVERY else sum(_noted_bytes(each, "smaps_rollup", "Pss:") for each in processes)
 
 
 def machine_busy_s() -> float:
@@ -71,11 +80,11 @@ def run_command(command: list[str], output: Path) -> tuple[Cost, str]:
     Raises CommandError if it fails.
     """
     printed, complaints = output.parent / "printed", output.parent / "complaints"
-    peak, busy_s, started = 0, machine_busy_s(), perf_counter()
+    peak, look, busy_s, started = 0, 0, machine_busy_s(), perf_counter()
     with open(printed, "wb") as out, open(complaints, "wb") as err, subprocess.Popen(command, stdout=out, stderr=err) as process:
         with open(os.pidfd_open(process.pid), "rb", buffering=0) as end:
             while not select([end], [], [], PERIOD_S)[0]:
-                peak = max(peak, sum(map(_peak_bytes, _family(process.pid))))
+                peak, look = max(peak, _held_bytes(_family(process.pid), look)), look + 1
         wall_s = perf_counter() - started
         _, status, usage = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)

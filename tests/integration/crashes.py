@@ -14,6 +14,7 @@ from typing import Any
 from schemas.settings import BuildSettings
 from tiler.building.build import build_layer
 from tiler.stores.directory import DirectoryStore
+from tiler.tasks.processes import ProcessEngine, can_fork
 
 
 def in_a_child(job: dict[str, Any], writes: int | None) -> bool:
@@ -22,7 +23,8 @@ def in_a_child(job: dict[str, Any], writes: int | None) -> bool:
     if child == 0:
         if writes is not None:
             die_at(writes)
-        build_layer(Path(job["source"]), job["output"], BuildSettings(**job["settings"]))
+        engine = ProcessEngine(2) if job["processes"] else None
+        build_layer(Path(job["source"]), job["output"], BuildSettings(**job["settings"]), engine=engine)
         os._exit(0)
     status = os.waitpid(child, 0)[1]
     if status not in (0, signal.SIGKILL):
@@ -31,7 +33,8 @@ def in_a_child(job: dict[str, Any], writes: int | None) -> bool:
 
 
 def die_at(writes: int) -> None:
-    count = 0
+    """Kill the build at the n-th write or delete of one of its processes."""
+    count, build = 0, os.getpid()
 
     def dying(name: str) -> Any:
         method = getattr(DirectoryStore, name)
@@ -40,21 +43,23 @@ def die_at(writes: int) -> None:
             nonlocal count
             count += 1
             if count == writes and writes % 2:
-                os.kill(os.getpid(), signal.SIGKILL)
+                os.kill(build, signal.SIGKILL)
             result = method(*arguments)
             if count >= writes:
-                os.kill(os.getpid(), signal.SIGKILL)
+                os.kill(build, signal.SIGKILL)
             return result
 
         return act
 
-    for name in ("write", "delete", "delete_prefix", "sync"):
+    for name in ("write", "write_unnamed", "delete", "delete_prefix", "sync"):
         setattr(DirectoryStore, name, dying(name))
 
 
 def main() -> None:
     """Kill the build again and again, then let it end; prints how often it was killed."""
     job = json.load(sys.stdin)
+    if job["processes"] and not can_fork():
+        raise SystemExit("this process has threads")
     chance = random.Random(job["seed"])
     killed = sum(in_a_child(job, chance.randrange(*job["writes"])) for _ in range(job["kills"]))
     if job["finish"]:

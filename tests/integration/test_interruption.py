@@ -180,18 +180,21 @@ def test_a_build_that_finished_nothing_leaves_nothing(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_a_full_disk_is_a_sentence(height_tiff: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("call", ["write", "replace"])
+def test_a_full_disk_is_a_sentence(call: str, height_tiff: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Noticed when the bytes of a block are written, or when a record gets its name."""
     calls = itertools.count()
-    rename = os.replace
+    original = getattr(os, call)
 
-    def replace(old: Any, new: Any) -> None:
-        if next(calls) == 40:
+    def failing(*arguments: Any) -> Any:
+        if next(calls) == (40 if call == "write" else 1):
             raise OSError(28, os.strerror(28))
-        rename(old, new)
+        return original(*arguments)
 
-    monkeypatch.setattr(os, "replace", replace)
+    monkeypatch.setattr(os, call, failing)
     with pytest.raises(StorageError, match="No space left on device"):
         build_layer(height_tiff, tmp_path / "out", settings())
+    monkeypatch.undo()
     assert not (tmp_path / "out").exists()
 
 

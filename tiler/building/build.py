@@ -4,13 +4,11 @@ Whatever a task has finished is kept until the layer is published, however a bui
 """
 
 import os
-import resource
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Literal
+from typing import Final, Literal
 
 from schemas.errors import UsageError
 from schemas.manifest import Layer, Manifest
@@ -27,9 +25,12 @@ from tiler.stores.dataset import Dataset, read_manifest
 from tiler.stores.locate import open_store
 from tiler.tasks.cut import StageTimes
 from tiler.tasks.engine import Engine, LocalEngine
+from tiler.tasks.memory import peak_bytes
 from tiler.tasks.records import RecordBook
 from tiler.tasks.stamps import SourceStamps
 
+_LEAST_SAMPLES: Final = 16 << 20
+"""Of a source whose tasks are run in processes."""
 Outcome = Literal["built", "continued", "updated", "up to date"]
 
 
@@ -90,7 +91,7 @@ def build_layer(
             intent = decide(store, claim, dataset, plan, stamps, settings)
             if intent.act is None and dataset is not None:
                 return up_to_date(store, claim, dataset, plan, intent, settings.records, started)
-            engine = engine or LocalEngine(plan.workers)
+            engine = engine or _engine_for(plan)
             build = LayerBuild(plan, intent, sources, store, claim, dataset, stamps, settings, engine)
             build.run(on_progress)
         finally:
@@ -114,7 +115,7 @@ def up_to_date(store: Store, claim: Claim, dataset: Manifest, plan: Plan, intent
         times=StageTimes(),
         wall_s=perf_counter() - started,
         megasamples=plan.lattice.width * plan.lattice.height / 1e6,
-        peak_rss_bytes=_peak_rss_bytes(),
+        peak_rss_bytes=peak_bytes(),
         tasks=plan.task_count,
         tasks_kept=plan.task_count,
         blocks_written=0,
@@ -138,20 +139,20 @@ def report_of(build: LayerBuild, intent: Intent, claim: Claim, wall_s: float) ->
         times=build.times,
         wall_s=wall_s,
         megasamples=plan.lattice.width * plan.lattice.height / 1e6,
-        peak_rss_bytes=_peak_rss_bytes(),
+        peak_rss_bytes=peak_bytes() + build.processes_bytes,
         tasks=plan.task_count,
         tasks_kept=build.kept,
         blocks_written=build.written,
     )
 
 
-def _peak_rss_bytes() -> int:
-    """Return the largest resident set this process has had; ``getrusage`` would count a parent's, inherited by fork."""
-    with suppress(OSError):
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+def _engine_for(plan: Plan) -> Engine:
+    """Return what runs the tasks on this machine: processes, unless the source is too small for them to make up for their start."""
+    if plan.workers == 1 or plan.lattice.level_rect(0).area < _LEAST_SAMPLES:
+        return LocalEngine(plan.workers)
+    from tiler.tasks.processes import ProcessEngine  # noqa: PLC0415 - 10 ms of every start
+
+    return ProcessEngine(plan.workers)
 
 
 def refuse_inside(path: Path, store: Store) -> None:

@@ -86,6 +86,11 @@ class LayerBuild:
             self._book.delete()
         self._claim.announce(*intent.kept)
 
+    @property
+    def processes_bytes(self) -> int:
+        """What processes of this machine in which tasks ran held at most, besides what they shared with this one [bytes]."""
+        return int(getattr(self._engine, "peak_bytes", 0))
+
     @contextmanager
     def _kept_on_failure(self) -> Iterator[None]:
         """Say how much is kept when a build does not end; if no task was finished there is nothing to keep."""
@@ -110,7 +115,7 @@ class LayerBuild:
             self._copy.make(plan.source)
         ledger = Ledger(plan.lattice, plan.source.conversion.channels)
         published = Dataset(self._store, self._dataset) if self._is_update and self._dataset is not None else None
-        target = make_target(plan, self._store, intent.path, published)
+        target = replace(make_target(plan, self._store, intent.path, published), unnamed=True)
         worker = TaskWorker(plan, target, self._book, self._stamps, _Counter(plan, on_progress).add, self._job(record))
         pieces: dict[Task, str] = {}
         for tier in plan.tiers:

@@ -8,7 +8,7 @@ level into windows of any shape gives the same bits as filtering it in one piece
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -207,7 +207,7 @@ class _Stage:
         bottom = self._top + self._rows.count
         last = min(self._coarse.y1, (bottom - 1 - self._after) // 2 + 1)
         first, count = self._next, last - self._next
-        if count <= 0:
+        if count <= 0 or (count < _LEAST_ROWS and last < self._coarse.y1):
             return None
         row, column = 2 * first - self._top, 2 * self._coarse.x0 - (self._fine.x0 - self._left)
         values = self._filtered(row, column, count)
@@ -261,6 +261,10 @@ class _Stage:
 
 
 _NO_COVERAGE = np.empty((0, 0), np.float32)
+_PUSHED_ROWS: Final = 64
+"""Rows filtered at once: few enough for their levels to stay in the second-level cache, and for little memory."""
+_LEAST_ROWS: Final = 32
+"""Rows that a stage gives at once if it can: on coarse levels, where a row is short, a call would cost more than its work."""
 
 
 class Cascade:
@@ -281,9 +285,13 @@ class Cascade:
 
     def push(self, values: Values, coverage: Coverage | None) -> None:
         """Take the next rows of the finest window and hand every level's complete rows to the sink."""
-        first, level = self._row, 0
+        self._sink(0, self._row, values, coverage)
         self._row += len(values)
-        self._sink(0, first, values, coverage)
+        for row in range(0, len(values), _PUSHED_ROWS):
+            rows = slice(row, row + _PUSHED_ROWS)
+            self._coarsen(values[rows], None if coverage is None else coverage[rows])
+
+    def _coarsen(self, values: Values, coverage: Coverage | None) -> None:
         for level, stage in enumerate(self._stages, start=1):
             emitted = stage.push(values, coverage)
             if emitted is None:

@@ -20,6 +20,8 @@ from schemas.settings import BuildSettings, HeightEncoding
 from tiler.sources import FileInfo, Pixels, Reader
 from tiler.sources.whole import take_whole
 
+_HASHED_BYTES: Final = 256 << 10
+"""Digested at once: half of what a second-level cache holds at least."""
 _EXACT_INTEGERS: Final = 2**24
 """Whole numbers up to here survive the conversion to float32."""
 _HIGHEST: Final = 1e30
@@ -169,9 +171,12 @@ class Source:
         pixels, mask = self._reader.read(window)
         for part, hasher in zip((pixels, mask), getattr(self._local, "hashers", ()), strict=False):
             if part is not None:
-                # As the file has them: a quarter of the bytes that the same samples take as float32. In one piece: by rows, which
-                # would need no copy, threads get into each other's way, as each row frees Python's lock and takes it again.
-                hasher.update(np.ascontiguousarray(part))
+                # As the file has them: a quarter of the bytes that the same samples take as float32. Some rows at a time: their copy
+                # stays in the cache; by single rows, which would need no copy, threads get into each other's way, as each row frees
+                # Python's lock and takes it again.
+                rows = max(1, _HASHED_BYTES // max(1, part[0].nbytes))
+                for y in range(0, len(part), rows):
+                    hasher.update(np.ascontiguousarray(part[y : y + rows]))
         return pixels, mask
 
     def _converted(self, pixels: Pixels, mask: NDArray[np.uint8] | None) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:

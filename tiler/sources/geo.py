@@ -11,6 +11,7 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio._err import CPLE_BaseError
 from rasterio.enums import ColorInterp, MaskFlags
+from rasterio.env import get_gdal_config, set_gdal_config
 from rasterio.errors import CRSError, NotGeoreferencedWarning, RasterioError
 from rasterio.windows import Window
 
@@ -23,6 +24,8 @@ _FAILURES = (RasterioError, CPLE_BaseError, MemoryError)
 """What rasterio raises on damaged files; where it reads more than pixels, GDAL's own errors come through as they are."""
 _OPENING = threading.Lock()
 """Filters of warnings belong to the process: two threads that change and restore them would let one through, or lose one."""
+_LEAST_CACHE_BYTES = 64 << 20
+"""Some rows of tiles of 512 under a task of 4096; with less every tile would be decoded for every portion of rows."""
 _WHOLE_IMAGE_DRIVERS = {"PNG", "JPEG", "GIF", "BMP", "WEBP"}
 """Drivers whose files can only be decoded from top to bottom."""
 
@@ -33,6 +36,11 @@ def _open(path: Path) -> Any:  # noqa: ANN401 - rasterio has no types
     with _OPENING, warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         return rasterio.open(path)
+
+
+def share_cache(processes: int) -> None:
+    """Let GDAL keep decoded tiles in so small a part of the memory that as many ``processes`` keep no more than one would."""
+    set_gdal_config("GDAL_CACHEMAX", max(_LEAST_CACHE_BYTES, int(get_gdal_config("GDAL_CACHEMAX")) // processes))
 
 
 def describe(path: Path) -> FileInfo | None:

@@ -26,6 +26,9 @@ class UnopenedError(InputError):
 def _open(path: Path) -> OpenImageIO.ImageInput:
     # OpenImageIO refuses files that declare more than its limit (32 GiB by default), which is what clipmap is for.
     OpenImageIO.attribute("limits:imagesize_MB", 2**31 - 1)
+    # Of its own it would start a thread per processor beside ours, and a process with threads cannot be copied.
+    OpenImageIO.attribute("threads", 1)
+    OpenImageIO.attribute("exr_threads", -1)
     config = OpenImageIO.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
     handle = OpenImageIO.ImageInput.open(str(path), config)

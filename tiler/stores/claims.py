@@ -95,6 +95,19 @@ class ClaimNote:
         """Whether the note was written on another machine than this one."""
         return self.machine not in ("", os.uname().nodename)
 
+    @property
+    def is_gone(self) -> bool:
+        """Whether the process that wrote the note is certain to have ended: on this machine, and no such process is there."""
+        if self.elsewhere or not self.machine or not self.process.isdecimal():
+            return False
+        try:
+            os.kill(int(self.process), 0)
+        except ProcessLookupError:
+            return True
+        except (OSError, OverflowError):
+            return False
+        return False
+
     def at_work(self) -> str:
         """Return who is at work and for how long: 'process 123 of maria on a1, for 3 h 12 min, since 2026-11-22 18:50 UTC'."""
         who = f"process {self.process or 'unknown'}"

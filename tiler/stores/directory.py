@@ -1,4 +1,4 @@
-"""A store in a directory: one file per key, written to a temporary name and renamed."""
+"""A store in a directory: one file per key, written to a temporary name and renamed, but for what nothing names yet."""
 
 import ctypes
 import os
@@ -18,21 +18,26 @@ _TEMPORARY = ".tmp-"
 _LIBC = ctypes.CDLL(None, use_errno=True)
 
 
-def _write_file(path: str, data: bytes) -> None:
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+def _write_file(path: str, data: bytes, flag: int) -> None:
+    """Write a file, opened with ``flag``; leaves none if it cannot be written to the end. Raises OSError."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | flag, 0o666)
     try:
-        written = os.write(descriptor, data)
-        while written < len(data):  # a file system that is nearly full, or more than 2 GiB
-            written += os.write(descriptor, memoryview(data)[written:])
-    finally:
-        os.close(descriptor)
+        try:
+            written = os.write(descriptor, data)
+            while written < len(data):  # a file system that is nearly full, or more than 2 GiB
+                written += os.write(descriptor, memoryview(data)[written:])
+        finally:
+            os.close(descriptor)
+    except BaseException:
+        Path(path).unlink(missing_ok=True)
+        raise
 
 
 class DirectoryStore:
     """Keys are file paths below ``root``; the directory is created by the first write. Hidden names (``.x``) are no keys.
 
     ``write`` renames a finished temporary file over the key, so a killed process leaves at most files whose
-    names begin with ``.tmp-``, which no reader sees.
+    names begin with ``.tmp-``, which no reader sees. ``write_unnamed`` is for what no reader looks for yet.
     """
 
     def __init__(self, root: Path) -> None:
@@ -68,12 +73,30 @@ class DirectoryStore:
         """Put ``data`` under ``key`` in one step; raises StorageError."""
         # Strings instead of Path objects: a build writes thousands of files a second, and every thread waits for this one meanwhile.
         *folders, name = check_key(self.location, key)
+        self._replace("/".join((self._folder, *folders)), name, data)
+
+    def write_unnamed(self, key: str, data: bytes) -> None:
+        """Put ``data`` under a ``key`` that nothing names yet; a process that is killed may leave a part of it. Raises StorageError.
+
+        Without the temporary name a file of 25 kB takes 50 us instead of 70. What lies under the key is replaced as ever: it may be
+        a link, or be linked to from elsewhere.
+        """
+        *folders, name = check_key(self.location, key)
         folder = "/".join((self._folder, *folders))
+        try:
+            self._make_folder(folder)
+            _write_file(f"{folder}/{name}", data, os.O_EXCL)
+        except FileExistsError:
+            self._replace(folder, name, data)
+        except OSError as error:
+            raise StorageError(f"{folder}/{name}: cannot be written: {error.strerror}") from error
+
+    def _replace(self, folder: str, name: str, data: bytes) -> None:
         temporary = f"{folder}/{_TEMPORARY}{os.getpid()}-{threading.get_ident()}-{name}"
         try:
             self._make_folder(folder)
             try:
-                _write_file(temporary, data)
+                _write_file(temporary, data, os.O_TRUNC)
                 os.replace(temporary, f"{folder}/{name}")
             except BaseException:
                 Path(temporary).unlink(missing_ok=True)
@@ -141,7 +164,7 @@ class DirectoryStore:
         try:
             made = [folder for folder in (self._root, *self._root.parents) if not folder.exists()]
             self._root.mkdir(parents=True, exist_ok=True)
-            descriptor = open_locked(path, lambda taken: StorageError(_at_work(self.location, _read_note(taken), break_stale)))
+            descriptor = open_locked(path, lambda taken: _refusal(self.location, _read_note(taken), break_stale))
         except (FileExistsError, NotADirectoryError):
             raise StorageError(f"{self._root}: a file is in the way, or a link that leads nowhere; choose another folder") from None
         except OSError as error:
@@ -206,6 +229,11 @@ class BuildClaim:
 
     def confirm(self) -> None:
         """Do nothing: nobody but the kernel can end the hold, and only with the process."""
+
+
+def _refusal(location: str, note: ClaimNote | None, break_stale: bool) -> StorageError | None:
+    """Return the error for a build that comes second; None if the first was killed, and the processes it had started are ending."""
+    return None if note is not None and note.is_gone else StorageError(_at_work(location, note, break_stale))
 
 
 def _at_work(location: str, note: ClaimNote | None, break_stale: bool) -> str:

@@ -51,7 +51,11 @@ class CutBlock:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Where the blocks of a layer go and in what form."""
+    """Where the blocks of a layer go and in what form.
+
+    ``unnamed``: nothing names them before their task's record does, and no two processes run a task at a time; so a part of one that
+    a killed process leaves is made anew.
+    """
 
     store: Store
     destination: Destination
@@ -59,10 +63,13 @@ class Target:
     block: BlockFormat
     codec: Codec
     linear_light: bool = False
+    unnamed: bool = False
 
 
 class _Strip:
-    """Rounded rows of a level, from row ``top`` on, that wait for the block row ``block_y`` to be complete; moved, not made anew.
+    """Rounded rows of a level, from row ``top`` on, that wait for the block row ``block_y`` to be complete.
+
+    Rows that come when there are none stay where they are; only those that must wait are copied, to an array that is kept.
 
     ``whole`` are the samples of the level, ``core`` those of the task's blocks, ``padded`` those with what of their pad there is.
     """
@@ -73,24 +80,31 @@ class _Strip:
         self.rows = 0
         self._samples: Samples | None = None
         self._mask: Mask | None = None
+        self._own: Samples | None = None
 
     def append(self, samples: Samples, mask: Mask | None, capacity: int) -> None:
         """Add rows at the bottom; ``capacity`` is how many rows there will be at most."""
-        end = self.rows + len(samples)
-        shape = samples.shape[1:]
-        if self._samples is None or len(self._samples) < end:
-            grown = np.empty((max(capacity, end), *shape), samples.dtype)
-            if self._samples is not None:
-                grown[: self.rows] = self._samples[: self.rows]
-            self._samples = grown
-            if self._mask is not None:
-                self._mask = np.concatenate([self._mask, np.ones((len(grown) - len(self._mask), shape[0]), np.bool_)])
-        self._samples[self.rows : end] = samples
-        if mask is not None and self._mask is None:
-            self._mask = np.ones((len(self._samples), shape[0]), np.bool_)
-        if self._mask is not None:
-            self._mask[self.rows : end] = True if mask is None else mask
-        self.rows = end
+        if not self.rows:
+            self._samples, self._mask, self.rows = samples, mask, len(samples)
+            return
+        held = self._owned(max(capacity, self.rows + len(samples)))
+        held[self.rows : self.rows + len(samples)] = samples
+        if mask is not None or self._mask is not None:
+            parts = ((self._mask, self.rows), (mask, len(samples)))
+            whole = samples.shape[1]
+            self._mask = np.concatenate([np.ones((rows, whole), np.bool_) if part is None else part[:rows] for part, rows in parts])
+        self.rows += len(samples)
+
+    def _owned(self, capacity: int) -> Samples:
+        """Return the rows held in an array of our own that has room for ``capacity``."""
+        assert self._samples is not None
+        own = self._own
+        if own is None or len(own) < capacity:
+            own = np.empty((capacity, *self._samples.shape[1:]), self._samples.dtype)
+        if own is not self._samples:
+            own[: self.rows] = self._samples[: self.rows]
+        self._samples = self._own = own
+        return own
 
     def window(self, rows: slice, columns: slice) -> tuple[Samples, Mask | None]:
         """Return samples, contiguous, and mask, None if all are valid; rows count from ``top``."""
@@ -100,14 +114,15 @@ class _Strip:
 
     def drop_above(self, y: int) -> None:
         """Forget the rows above ``y``."""
+        assert self._samples is not None
         gone = max(0, y - self.top)
         kept = max(0, self.rows - gone)
-        for held in (self._samples, self._mask):
-            if held is not None:
-                held[:kept] = held[gone : self.rows]
-        if self._mask is not None and self._mask[:kept].all():
-            self._mask = None
+        samples, mask = self._samples[gone : self.rows], None if self._mask is None else self._mask[gone:]
         self.top, self.rows = self.top + gone, kept
+        self._samples = samples if kept else None
+        self._mask = None if mask is None or mask.all() else mask
+        if kept:
+            self._owned(kept)  # or all that came with these rows would be held
 
 
 class Cutter:
@@ -126,7 +141,7 @@ class Cutter:
         self._core = core
         self._on_block = on_block
         self._strips: dict[int, _Strip] = {}
-        self._writes = TaskWrites(target.store)
+        self._writes = TaskWrites(target.store, target.unnamed)
 
     def finish(self) -> None:
         """Return when all blocks are stored; raises StorageError if one could not be."""

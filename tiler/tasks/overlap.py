@@ -11,6 +11,7 @@ from functools import cache
 from typing import Final, TypeVar
 
 from tiler.stores import Store
+from tiler.stores.directory import DirectoryStore
 from tiler.stores.locate import is_remote
 
 Item = TypeVar("Item")
@@ -30,21 +31,24 @@ def _lanes(kind: str, count: int) -> ThreadPoolExecutor:
 
 
 class TaskWrites:
-    """The writes of one task; ``finish`` returns when all have been made, and nothing may rely on one before."""
+    """The writes of one task; ``finish`` returns when all have been made, and nothing may rely on one before.
 
-    def __init__(self, store: Store) -> None:
-        self._store = store
+    ``unnamed``: nothing names the keys before, so that a killed process may leave a part of one.
+    """
+
+    def __init__(self, store: Store, unnamed: bool = False) -> None:
+        self._write = store.write_unnamed if unnamed and isinstance(store, DirectoryStore) else store.write
         self._overlapping = is_remote(store.location)
         self._pending: deque[Future[None]] = deque()
 
     def write(self, key: str, data: bytes) -> None:
         """Write, or begin to; raises StorageError, also that of an earlier write."""
         if not self._overlapping:
-            self._store.write(key, data)
+            self._write(key, data)
             return
         while len(self._pending) >= _WAITING:
             self._pending.popleft().result()
-        self._pending.append(_lanes("write", _WRITES).submit(self._store.write, key, data))
+        self._pending.append(_lanes("write", _WRITES).submit(self._write, key, data))
 
     def finish(self) -> None:
         """Wait for all writes; raises the StorageError of the first that failed."""

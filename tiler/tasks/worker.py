@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from time import perf_counter
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from schemas.errors import InputError, NotFoundError
 from schemas.manifest import digest
 from schemas.region import Rect
@@ -12,10 +14,12 @@ from tiler.building.plan import Plan
 from tiler.filters.cascade import Cascade, Coverage, Values, held_windows
 from tiler.stores import Store
 from tiler.tasks.cut import CutBlock, Cutter, StageTimes, Target
+from tiler.tasks.measure import measure
 from tiler.tasks.overlap import read_all
 from tiler.tasks.partition import Task
 from tiler.tasks.pieces import PieceReader, PieceRef, PieceWriter
 from tiler.tasks.records import RecordBook, TaskRecord
+from tiler.tasks.rounding import round_samples
 from tiler.tasks.stamps import SourceStamps
 
 if TYPE_CHECKING:
@@ -24,14 +28,23 @@ if TYPE_CHECKING:
 _PORTION_ROWS: Final = 256
 _PORTION_BYTES: Final = 8 << 20
 _MAX_PORTION_ROWS: Final = 1024
-_PUSHED_ROWS: Final = 64
-"""Rows filtered at once: few enough for their levels to stay in the second-level cache, and for little memory."""
+_LEAST_PUSHED_ROWS: Final = 256
+"""Rows handed on at once, in whole rows of blocks: these are then cut out of what was read, without a copy in between."""
 
 
 def portion_rows(width: int, channels: int, chunk_rows: int) -> int:
     """Return how many rows of ``width`` samples a task reads at once, of a source that decodes ``chunk_rows`` rows together."""
     affordable = _PORTION_BYTES // (width * channels * 4)
     return min(max(1, min(affordable, _PORTION_ROWS) // chunk_rows) * chunk_rows, _MAX_PORTION_ROWS)
+
+
+def _slices(window: Rect, step: int) -> Iterator[slice]:
+    """Yield the rows of ``window``, counted from its top, that lie between multiples of ``step``."""
+    y = window.y0
+    while y < window.y1:
+        end = min(window.y1, (y // step + 1) * step)
+        yield slice(y - window.y0, end - window.y0)
+        y = end
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +67,7 @@ class Done:
 
 
 class TaskWorker:
-    """Runs tasks of one layer, from several threads; ``on_block`` is called once per finished block.
+    """Runs tasks of one layer, from several threads; ``on_block`` is told how many more blocks are finished.
 
     A task whose record holds (same plan, same input, its blocks where they belong) is not run again.
     """
@@ -69,7 +82,7 @@ class TaskWorker:
         job: "Job | None" = None,
     ) -> None:
         self._plan, self._target, self._book, self._stamps = plan, target, book, stamps
-        self._on_block = on_block
+        self.on_block = on_block
         self.job = job
         """What other processes need to know to run the same tasks; None if none may."""
 
@@ -80,7 +93,21 @@ class TaskWorker:
 
     def count(self, done: Done) -> None:
         """Count the blocks of a task that another process has run."""
-        self._on_block(len(done.record.index()))
+        self.on_block(len(done.record.index()))
+
+    def warm(self) -> None:
+        """Load what tasks call, kernels mostly, without a sample of the source: a copy of this process then need not."""
+        plan, side = self._plan, 64
+        lean = plan.block.dtype if plan.recipe.edge == "mirror" and not plan.recipe.masked and not plan.linear_light else "float32"
+        windows = held_windows((side, side), Rect(0, 0, side, side), [0] * 3, plan.recipe.kernel.reach)
+
+        def sink(level: int, first: int, values: Values, coverage: Coverage | None) -> None:
+            samples, _ = round_samples(values, coverage, plan.block, plan.linear_light)
+            measure(samples, None, plan.block.channels - plan.block.alpha)
+
+        values = np.zeros((side, side, plan.source.conversion.channels), lean)
+        Cascade((side, side), windows, values.shape[2], plan.recipe, sink).push(values, None)
+        plan.codec.encode(np.zeros((plan.block.side, plan.block.side, plan.block.channels), plan.block.dtype), None)
 
     def __call__(self, work: Work) -> Done:
         """Run a task, or find that its record holds; raises InputError or StorageError."""
@@ -88,7 +115,7 @@ class TaskWorker:
         kept = None if held is None else self._still_valid(work, held)
         if kept is None:
             return self.run(work)
-        self._on_block(len(kept.index()))
+        self.on_block(len(kept.index()))
         return Done(work.task, kept, StageTimes(), kept=True, written=0)
 
     def _still_valid(self, work: Work, held: TaskRecord) -> TaskRecord | None:
@@ -143,7 +170,7 @@ class TaskWorker:
 
         def on_block(block: CutBlock) -> None:
             blocks.append(block)
-            self._on_block(1)
+            self.on_block(1)
 
         windows = self._windows(task)
         cutter = Cutter(self._target, tier.first, task.core, on_block)
@@ -181,8 +208,7 @@ class TaskWorker:
             before_read = perf_counter()
             values, coverage = samples.read_lean(window)
             times.read_s += perf_counter() - before_read
-            for row in range(0, window.height, _PUSHED_ROWS):
-                rows = slice(row, row + _PUSHED_ROWS)
+            for rows in _slices(window, max(plan.lattice.block, _LEAST_PUSHED_ROWS)):
                 cascade.push(values[rows], None if coverage is None else coverage[rows])
         times.filter_s = perf_counter() - started - times.read_s - times.encode_s - times.write_s
         return "" if first else plan.source.digest()
