@@ -58,10 +58,9 @@ class KeptTerrain:
             self._tops = _moved(self._tops, dropped << FINEST, kept, needed)
             self._finest = _moved(self._finest, dropped, -(-kept >> FINEST), -(-needed >> FINEST))
         else:
-            for array, begin, size in ((self._heights, dropped << FINEST, kept), (self._tops, dropped << FINEST, kept)):
-                array[:size] = array[begin : begin + size]
-            blocks = -(-kept >> FINEST)
-            self._finest[:blocks] = self._finest[dropped : dropped + blocks]
+            _move_up(self._heights, dropped << FINEST, kept)
+            _move_up(self._tops, dropped << FINEST, kept)
+            _move_up(self._finest, dropped, -(-kept >> FINEST))
         self.first += dropped << FINEST
         return kept
 
@@ -79,6 +78,13 @@ def _moved(array: NDArray[Sample], begin: int, count: int, size: int) -> NDArray
     larger = np.empty((size, *array.shape[1:]), array.dtype)
     larger[:count] = array[begin : begin + count]
     return larger
+
+
+def _move_up(array: NDArray[Sample], begin: int, count: int) -> None:
+    """Move ``count`` rows of ``array`` from ``begin`` on to its front, in pieces that do not overlap: else NumPy copies them all twice."""
+    for start in range(0, count if begin else 0, max(begin, 1)):
+        stop = min(start + begin, count)
+        array[start:stop] = array[begin + start : begin + stop]
 
 
 def _pyramid_table(shape: tuple[int, ...]) -> Int64:

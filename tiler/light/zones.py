@@ -173,7 +173,7 @@ def split(core: Rect, axis_of: Callable[[Rect], tuple[int | None, SunView | None
 
 
 def steady(size_m: float) -> float:
-    """Return a height [m], not negative, rounded up by an eighth at most: an update that moves the highest summit a little moves no zone."""
+    """Return a height [m], not negative, rounded up by an eighth at most: an update that lifts the highest summit moves no zone."""
     if size_m <= 0:
         return 0.0
     step = 2.0 ** (math.floor(math.log2(size_m)) - 3)
