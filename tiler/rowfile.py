@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,6 +13,10 @@ from schemas.errors import StorageError
 from schemas.region import Rect
 
 _MEMORY_LIMIT_BYTES: Final = 64 << 20
+_WASTE_BYTES: Final = 1 << 13
+"""What is read of a row for nothing at most: a call of its own for every row costs about as much."""
+_PIECE_BYTES: Final = 1 << 18
+"""Read at once where a strip is not asked for as it lies: what fits the cache is not fetched from memory again."""
 
 
 class RowFile:
@@ -20,10 +25,14 @@ class RowFile:
     Up to 64 MiB stay in memory. Beyond that the rows lie in a file in ``folder`` that has no name, so it vanishes with the
     process however that ends; it is read and written by position, not mapped, so that it does not count as the process's
     memory. Raises StorageError if the file cannot be made or written.
+
+    With ``strip`` the file has strips of so many columns, one after the other, so that whole strips are read and written in one piece,
+    as whole rows are without: a picture that is swept along its rows and along its columns is best cut so.
     """
 
-    def __init__(self, width: int, height: int, channels: int, dtype: np.dtype[Any], folder: Path) -> None:
+    def __init__(self, width: int, height: int, channels: int, dtype: np.dtype[Any], folder: Path, strip: int | None = None) -> None:
         self._shape = (height, width, channels)
+        self._strip = strip or width
         self._dtype = dtype
         self._folder = folder
         self._pixel_bytes = channels * dtype.itemsize
@@ -38,8 +47,19 @@ class RowFile:
         except OSError as error:
             raise StorageError(f"{folder}: no scratch file can be made there: {error.strerror}") from error
 
+    def _strips(self, x0: int, x1: int) -> Iterator[Rect]:
+        """Yield the columns ``x0`` up to before ``x1`` by the strips that they are in, as windows of all their rows."""
+        for x in range(x0 - x0 % self._strip, x1, self._strip):
+            yield Rect(max(x, x0), 0, min(x + self._strip, x1), self._shape[0])
+
+    def _strip_of(self, x: int) -> tuple[int, int]:
+        """Return the first column of the strip that column ``x`` is in, and how many it has."""
+        first = x - x % self._strip
+        return first, min(self._strip, self._shape[1] - first)
+
     def _offset(self, x: int, y: int) -> int:
-        return (y * self._shape[1] + x) * self._pixel_bytes
+        first, columns = self._strip_of(x)
+        return (first * self._shape[0] + y * columns + x - first) * self._pixel_bytes
 
     def write(self, x: int, y: int, pixels: NDArray[Any]) -> None:
         """Put ``pixels`` (rows, columns, channels) with their top-left one at (x, y)."""
@@ -47,12 +67,13 @@ class RowFile:
         if self._memory is not None:
             self._memory[y : y + rows, x : x + columns] = pixels
             return
-        packed = np.ascontiguousarray(pixels, self._dtype)
-        if columns == self._shape[1]:
-            self._write_bytes(packed.view(np.uint8).reshape(-1).data, self._offset(0, y))
-            return
-        for row in range(rows):
-            self._write_bytes(packed[row].view(np.uint8).reshape(-1).data, self._offset(x, y + row))
+        for part in self._strips(x, x + columns):
+            packed = np.ascontiguousarray(pixels[:, part.x0 - x : part.x1 - x], self._dtype)
+            if part.width == self._strip_of(part.x0)[1]:
+                self._write_bytes(packed.view(np.uint8).reshape(-1).data, self._offset(part.x0, y))
+                continue
+            for row in range(rows):
+                self._write_bytes(packed[row].view(np.uint8).reshape(-1).data, self._offset(part.x0, y + row))
 
     def _write_bytes(self, view: memoryview, offset: int) -> None:
         try:
@@ -67,9 +88,26 @@ class RowFile:
         if self._memory is not None:
             return self._memory[window.y0 : window.y1, window.x0 : window.x1]
         pixels = np.empty((window.height, window.width, self._shape[2]), self._dtype)
-        for row in range(window.height):
-            self._read_bytes(pixels[row].view(np.uint8).reshape(-1).data, self._offset(window.x0, window.y0 + row))
+        for part in self._strips(window.x0, window.x1):
+            self._read_strip(part, window, pixels[:, part.x0 - window.x0 : part.x1 - window.x0])
         return pixels
+
+    def _read_strip(self, part: Rect, window: Rect, out: NDArray[Any]) -> None:
+        """Read the rows of a ``window`` from the columns ``part`` of a strip, in few pieces, or row by row if that is less work."""
+        first, columns = self._strip_of(part.x0)
+        if (columns - part.width) * self._pixel_bytes > _WASTE_BYTES:
+            for y in range(window.height):
+                self._read_bytes(out[y].view(np.uint8).reshape(-1).data, self._offset(part.x0, window.y0 + y))
+            return
+        if out.flags.c_contiguous and part.width == columns:
+            self._read_bytes(out.view(np.uint8).reshape(-1).data, self._offset(first, window.y0))
+            return
+        rows = max(1, _PIECE_BYTES // (columns * self._pixel_bytes))
+        whole = np.empty((min(rows, window.height), columns, self._shape[2]), self._dtype)
+        for y in range(0, window.height, rows):
+            found = whole[: window.height - y]
+            self._read_bytes(found.view(np.uint8).reshape(-1).data, self._offset(first, window.y0 + y))
+            out[y : y + len(found)] = found[:, part.x0 - first : part.x1 - first]
 
     def _read_bytes(self, line: memoryview, offset: int) -> None:
         try:

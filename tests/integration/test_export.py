@@ -82,7 +82,7 @@ def test_the_forms_of_the_command_are_those_there_are(capfd: pytest.CaptureFixtu
         (["cog"], 2, "has height and imagery; say which one with --layer"),
         (["cog", "--layer", "height", "--half"], 2, "--half, --float and --codes are for exr"),
         (["cog", "--layer", "light"], 3, "no layer 'light' in"),
-        (["dzi", "--layer", "height"], 2, "heights are no pictures; export them as cog or exr"),
+        (["dzi", "--layer", "height"], 2, "heights and normals are no pictures; export them as cog or exr"),
         (["exr", "--layer", "height", "-o", "nowhere/a.exr"], 4, "there is no folder nowhere"),
     ],
 )

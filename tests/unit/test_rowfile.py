@@ -13,11 +13,14 @@ from tiler import rowfile
 from tiler.rowfile import RowFile
 
 
+@pytest.mark.parametrize("strip", [None, 1, 8, 33, 64, 200])
 @pytest.mark.parametrize("limit", [0, 1 << 30])
-def test_rowfile_windows_are_written_and_read_back(limit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rowfile_windows_are_written_and_read_back(limit: int, strip: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rowfile, "_MEMORY_LIMIT_BYTES", limit)
     whole = content(3, "float32", 101, 67)
-    rows = RowFile(101, 67, 3, np.dtype(np.float32), tmp_path)
+    monkeypatch.setattr(rowfile, "_PIECE_BYTES", 4000)
+    monkeypatch.setattr(rowfile, "_WASTE_BYTES", 300)
+    rows = RowFile(101, 67, 3, np.dtype(np.float32), tmp_path, strip)
     for y in range(0, 67, 20):
         for x in range(0, 101, 33):
             rows.write(x, y, whole[y : y + 20, x : x + 33])

@@ -11,8 +11,9 @@ from typing import Final
 
 import numpy as np
 
+from tiler.light.bracketing import bracket_rows, darken_rows, range_of
 from tiler.light.frame import Earth, Frame, Shape, SunPosition
-from tiler.light.marching import bracket_rows, darken_rows, march_undecided, range_of
+from tiler.light.marching import march_undecided
 from tiler.light.shadow import Rays, check_rows, rays_of, uniform_codes
 from tiler.light.sweeping import NOTHING, VOID, Codes, Float32, Float64
 from tiler.light.terrainkept import KeptTerrain

@@ -57,7 +57,7 @@ class HeightGrid:
         self.block = lattice.block
         self.range_m = (0.0, 0.0)
         self._refiner = Refiner(lattice.height, lattice.width) if density == 2 else None
-        self._rows = RowFile(self.shape[1], self.shape[0], 1, np.dtype(np.float32), scratch)
+        self._rows = RowFile(self.shape[1], self.shape[0], 1, np.dtype(np.float32), scratch, self.block)
         try:
             self._fill(reader, workers)
         except BaseException:

@@ -11,9 +11,10 @@ from typing import Final, TypeVar
 
 import numpy as np
 
+from tiler.light.bracketing import UNDECIDED
 from tiler.light.certified import Brackets, HeightExtent, reach_rows, slack_of
 from tiler.light.frame import Earth, Frame, Shape, SunPosition, tangent_deg
-from tiler.light.marching import UNDECIDED, march_horizons
+from tiler.light.marching import march_horizons
 from tiler.light.shadow import Rays, check_rows, rays_of
 from tiler.light.sweeping import SHADED, Codes, Float32
 from tiler.light.terrainkept import KeptTerrain

@@ -103,7 +103,7 @@ class SunSetting:
 
 def make_shares(heights: Heights, scratch: Path) -> RowFile:
     """Return a scratch file for one share per sample."""
-    return RowFile(heights.shape[1], heights.shape[0], 1, np.dtype(np.uint16), scratch)
+    return RowFile(heights.shape[1], heights.shape[0], 1, np.dtype(np.uint16), scratch, heights.block)
 
 
 def band_size(frame: Frame, block: int, threads: int = 1, samples: int = _BAND_SAMPLES) -> int:
@@ -226,7 +226,7 @@ def sky_shares(
     horizontal; beyond the grid nothing rises into it. What is missing of 65535 is filled by ground.
     """
     height, width = heights.shape
-    sums = RowFile(width, height, 1, np.dtype(np.uint32), scratch)
+    sums = RowFile(width, height, 1, np.dtype(np.uint32), scratch, heights.block)
     lock = threading.Lock()
     strips = [Rect(0, y, width, min(height, y + 256)) for y in range(0, height, 256)]
     found = zones or [whole_zone(heights, place, SunPosition(0.0, 90.0))]
