@@ -37,6 +37,9 @@ RAINIER: Final = Rect(740, 440, 996, 612)
 ZOOM: Final = 3
 DARKEST_SKY: Final = 0.6
 """Drawn black in the picture of the sky."""
+ALBEDO: Final = 0.3
+AMPLIFIED: Final = 24
+"""So many times as bright as it is is what the ground reflects drawn."""
 
 Picture = NDArray[np.float64]
 
@@ -117,12 +120,16 @@ def main() -> None:
     write("sky", part((open_sky - DARKEST_SKY) / (1 - DARKEST_SKY), RAINIER, ZOOM))
     write("all", part(for_screens(halved((cosine * flat_soft + SKY * open_sky) / (1 + SKY))), Rect(0, 0, 512, 512), 1))
     write("curvature", changed(flat_hard, round_hard, RAINIER, ZOOM))
+    write("refraction", changed(round_hard, bent_hard, RAINIER, ZOOM))
+    reflected = ALBEDO * (1 - open_sky) * float((cosine * flat_soft + SKY * open_sky).mean())
+    write("bounce", part(AMPLIFIED * reflected / (1 + SKY), RAINIER, ZOOM))
     partly = (flat_soft > 0) & (flat_soft < 1)
     sys.stdout.write(
         f"shaded: flat {100 * (1 - flat_hard.mean()):.2f} %, round {100 * (1 - round_hard.mean()):.2f} %, with refraction "
         f"{100 * (1 - bent_hard.mean()):.2f} %; changed by curvature {100 * (flat_hard != round_hard).mean():.2f} %, by refraction of "
         f"that {100 * (bent_hard != round_hard).mean():.2f} %; partly lit {100 * partly.mean():.2f} %; sky {open_sky.min():.2f} to 1, "
-        f"mean {open_sky.mean():.3f}\n"
+        f"mean {open_sky.mean():.3f}; reflected "
+        f"{255 * reflected.max() / (1 + SKY):.1f} codes at most, {255 * reflected.mean() / (1 + SKY):.2f} on average\n"
     )
 
 
