@@ -108,7 +108,7 @@ def test_a_scene_instead_of_options(clipmap: Clipmap, plain: Path, tmp_path: Pat
 def test_a_scene_with_a_time_for_heights_that_lie_nowhere(clipmap: Clipmap, tmp_path: Path) -> None:
     heights = np.zeros((40, 40, 1), np.float32)
     heights[3, 3] = 9
-    from tests.integration.test_light import plain_tiff
+    from tests.integration.lighting import plain_tiff
 
     plain_tiff(tmp_path / "dem.tif", heights[..., 0])
     assert clipmap("build", tmp_path / "dem.tif", "--layer", "height", "--spacing", 10, "-o", tmp_path / "out").code == 0

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cli.main import run
 from schemas.settings import LightSettings
 from tests.integration.files import settings, write_tiff
-from tests.integration.test_light import lit, plain_tiff, rough, samples, store_heights
+from tests.integration.lighting import lit, plain_tiff, rough, samples, store_heights
 from tiler.building.build import build_layer
 from tiler.building.light import build_light
 from tiler.geodesy import ground_spacing_m

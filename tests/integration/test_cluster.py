@@ -1,6 +1,5 @@
 """Builds on a real Dask cluster on loopback: a scheduler and worker processes of their own, and workers and builds that are killed."""
 
-import json
 import logging
 import os
 import re
@@ -10,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +17,7 @@ import pytest
 
 import tiler.cluster.engine
 from schemas.errors import InputError, MissingExtraError, StorageError, UsageError
+from tests.integration.dask_cluster import Cluster, two_workers, wait_until
 from tests.integration.files import settings, tree_digest, write_tiff
 from tests.reference.terrain import photo
 from tiler.building.build import build_layer
@@ -37,58 +37,14 @@ TASKS = 256 + 64 + 16 + 4 + 1 + 1
 """Of 1024 x 1024 samples in blocks of 32 and tasks of 64: a level a task."""
 
 
-class Cluster:
-    """A scheduler and its workers, each a process; ``environment`` is what workers see besides ours."""
-
-    def __init__(self, folder: Path, environment: dict[str, str]) -> None:
-        self._folder, self._environment = folder, os.environ | environment
-        self.workers: list[subprocess.Popen[bytes]] = []
-        found = folder / "scheduler.json"
-        self.scheduler = self._start("scheduler", "--scheduler-file", str(found), "--port", "0", "--host", "127.0.0.1", "--no-dashboard")
-        wait_until(lambda: found.exists() and found.read_text().endswith("}"))
-        self.address: str = json.loads(found.read_text())["address"]
-
-    def _start(self, kind: str, *arguments: str) -> "subprocess.Popen[bytes]":
-        command = [sys.executable, "-W", "ignore", "-m", f"distributed.cli.dask_{kind}", *arguments]
-        with (self._folder / f"{kind}.log").open("ab") as log:
-            return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=self._environment, cwd=self._folder)
-
-    def add_worker(self) -> "subprocess.Popen[bytes]":
-        options = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", str(self._folder)]
-        self.workers.append(self._start("worker", self.address, *options))
-        return self.workers[-1]
-
-    def stop(self) -> None:
-        for process in [*self.workers, self.scheduler]:
-            process.kill()
-            process.wait()
-
-
-def wait_until(condition: Callable[[], bool], seconds: float = 60) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.01)
-
-
 def records(out: Path) -> int:
     return len(list(out.glob("imagery/tasks/*/*/*.json")))
 
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Iterator[Cluster]:
-    """Two workers with a thread each, which also know the S3-speaking server if that can be started."""
-    try:
-        environment = request.getfixturevalue("s3_process").environment
-    except pytest.skip.Exception:
-        environment = {}
-    running = Cluster(tmp_path_factory.mktemp("cluster"), environment)
-    try:
-        for _ in range(2):
-            running.add_worker()
+    with two_workers(tmp_path_factory.mktemp("cluster"), request) as running:
         yield running
-    finally:
-        running.stop()
 
 
 @pytest.fixture(scope="module")

@@ -15,9 +15,9 @@ import pytest
 
 from schemas.errors import StorageError
 from schemas.settings import BuildSettings, LightSettings
+from tests.integration.dask_cluster import Cluster, two_workers, wait_until
 from tests.integration.files import tree_digest
-from tests.integration.test_cluster import Cluster, wait_until
-from tests.integration.test_light import plain_tiff, rough
+from tests.integration.lighting import plain_tiff, rough
 from tiler.building.build import build_layer
 from tiler.building.light import build_light
 from tiler.cluster.engine import DaskEngine
@@ -57,18 +57,8 @@ def records(out: Path) -> int:
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Iterator[Cluster]:
-    """Two workers with a thread each, which also know the S3-speaking server if that can be started."""
-    try:
-        environment = request.getfixturevalue("s3_process").environment
-    except pytest.skip.Exception:
-        environment = {}
-    running = Cluster(tmp_path_factory.mktemp("cluster"), environment)
-    try:
-        for _ in range(2):
-            running.add_worker()
+    with two_workers(tmp_path_factory.mktemp("cluster"), request) as running:
         yield running
-    finally:
-        running.stop()
 
 
 @pytest.fixture(scope="module")

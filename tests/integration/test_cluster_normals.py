@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from schemas.settings import LightSettings, NormalSettings
+from tests.integration.dask_cluster import Cluster
 from tests.integration.files import tree_digest
-from tests.integration.test_cluster import Cluster
-from tests.integration.test_light import rough, store_heights
+from tests.integration.lighting import rough, store_heights
 from tiler.building.light import build_light
 from tiler.building.normals import build_normals
 from tiler.cluster.engine import DaskEngine

@@ -11,7 +11,7 @@ import rasterio
 
 from schemas.errors import UsageError
 from tests.integration.export_datasets import exported
-from tests.integration.test_light import Array, light, rough, samples, store_heights
+from tests.integration.lighting import Array, light, rough, samples, store_heights
 
 
 @pytest.fixture(scope="module")

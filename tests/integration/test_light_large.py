@@ -7,7 +7,7 @@ import rasterio
 from rasterio.transform import Affine
 
 from schemas.settings import BuildSettings
-from tests.integration.test_light import light, samples
+from tests.integration.lighting import light, samples
 from tests.reference.sunrays import seen_from, sun_vector
 from tests.reference.terrain import power_law_field
 from tiler.building.build import build_layer

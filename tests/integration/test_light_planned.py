@@ -18,7 +18,7 @@ from schemas.scene import Scene
 from schemas.settings import BuildSettings, LightSettings
 from tests.contract.picture_files import write_with_rasterio
 from tests.integration.files import tree_digest
-from tests.integration.test_light import lit, rough, samples, store_heights
+from tests.integration.lighting import lit, rough, samples, store_heights
 from tiler.building.build import build_layer
 from tiler.building.light import LightReport, build_light
 from tiler.building.lightplan import EffectChoice, scene_of

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from schemas.manifest import Layer
 from schemas.settings import BuildSettings
 from tests.integration.files import tree_digest
-from tests.integration.test_light import CELL_M, light, lit, plain_tiff, ramp, rough, samples, store_heights, toward
+from tests.integration.lighting import CELL_M, light, lit, plain_tiff, ramp, rough, samples, store_heights, toward
 from tests.reference.edges import extend
 from tests.reference.kernels import taps
 from tests.reference.pyramid import coarsen

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from schemas.errors import NotFoundError, UsageError
 from schemas.settings import NormalSettings
 from tests.integration.files import assemble, tree_digest
-from tests.integration.test_light import CELL_M, lit, ramp, rough, store_heights, toward
+from tests.integration.lighting import CELL_M, lit, ramp, rough, store_heights, toward
 from tests.reference.midpoints import refined
 from tests.reference.pyramid import coarsen
 from tiler.building.normals import NormalReport, build_normals

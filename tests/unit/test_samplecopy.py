@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from schemas.errors import StorageError
 from schemas.region import Rect
 from schemas.settings import LightSettings
-from tests.integration.test_light import rough, store_heights
+from tests.integration.lighting import rough, store_heights
 from tiler.building.light import open_light
 from tiler.cluster.samplecopy import CopiedSamples, SampleCopy, copy_folder, delete_copy
 from tiler.light.lightsource import LightSource

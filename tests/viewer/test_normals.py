@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from schemas.errors import UsageError
 from schemas.settings import NormalSettings
-from tests.integration.test_light import CELL_M, store_heights
+from tests.integration.lighting import CELL_M, store_heights
 from tests.viewer.scenes import opened
 from tiler.building.normals import build_normals
 from viewer.camera import Camera
