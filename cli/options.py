@@ -1,5 +1,6 @@
 """What commands that read a source have in common: channel lists, and settings checked in one place."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import click
@@ -24,6 +25,12 @@ def build_settings(options: dict[str, Any]) -> BuildSettings:
     try:
         return BuildSettings(**options)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        option = "--" + str(first["loc"][0]).replace("_", "-") if first["loc"] else "options"
-        raise UsageError(f"{option}: {first['msg'].removeprefix('Value error, ')}") from error
+        raise refused(error, {}) from error
+
+
+def refused(error: ValidationError, options: Mapping[str, str]) -> UsageError:
+    """Return what settings are refused for first, and by which option; ``options`` name those that are not called as their settings."""
+    first = error.errors(include_url=False)[0]
+    name = str(first["loc"][0]) if first["loc"] else None
+    option = "options" if name is None else "--" + options.get(name, name).replace("_", "-")
+    return UsageError(f"{option}: {first['msg'].removeprefix('Value error, ')}")

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from cli.engines import open_engine
 from cli.light_effects import Wanted, choice_json, choice_pairs, refuse_contradictions, show_light_plan, sun_of, wanted_of
 from cli.light_text import effects_text, sun_text
+from cli.options import refused
 from cli.output import emit_json, emit_pairs, format_bytes
 from cli.progress import progress_bar
 from cli.scene_file import read_scene
@@ -167,10 +168,7 @@ def light_settings(options: dict[str, Any]) -> LightSettings:
     try:
         return LightSettings(**{**options, "shadows": shadows, "bits": int(options["bits"]), "density": 2 if twice else 1})
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        name = str(first["loc"][0]) if first["loc"] else "options"
-        option = {"azimuth_deg": "sun", "elevation_deg": "sun", "height": "from"}.get(name, name)
-        raise UsageError(f"--{option}: {first['msg'].removeprefix('Value error, ')}") from error
+        raise refused(error, {"azimuth_deg": "sun", "elevation_deg": "sun", "height": "from"}) from error
 
 
 def _as_json(report: "LightReport", choice: "EffectChoice | None") -> dict[str, Any]:

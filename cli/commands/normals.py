@@ -6,9 +6,9 @@ import click
 from pydantic import ValidationError
 
 from cli.engines import open_engine
+from cli.options import refused
 from cli.output import emit_json, emit_pairs, format_bytes
 from cli.progress import progress_bar
-from schemas.errors import UsageError
 from schemas.settings import NormalSettings
 
 if TYPE_CHECKING:
@@ -65,9 +65,7 @@ def normal_settings(options: dict[str, Any]) -> NormalSettings:
     try:
         return NormalSettings(**{**options, "density": density, "bits": int(options["bits"])})
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        name = str(first["loc"][0]) if first["loc"] else "options"
-        raise UsageError(f"--{ {'height': 'from'}.get(name, name) }: {first['msg'].removeprefix('Value error, ')}") from error
+        raise refused(error, {"height": "from"}) from error
 
 
 def _as_json(report: "NormalReport", dataset: str) -> dict[str, Any]:

@@ -1,28 +1,23 @@
 """Building a layer of light: the heights of a dataset, one sun, and the same tasks, records and manifest as any other layer."""
 
-import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from time import perf_counter
 from typing import Final
 
 from schemas.address import LAYER_NAME
-from schemas.errors import NotFoundError, UsageError
+from schemas.errors import UsageError
 from schemas.lattice import Lattice
 from schemas.light import Light
-from schemas.manifest import Layer, Manifest, SampleType, digest
-from schemas.region import Rect
-from schemas.settings import BuildSettings, LightSettings
-from tiler.building.build import BuildReport, report_of, up_to_date
-from tiler.building.intent import Intent, decide
-from tiler.building.layer import LayerBuild, Progress
-from tiler.building.leftovers import sweep
+from schemas.manifest import Layer, Manifest, SampleType
+from schemas.settings import LightSettings
+from tiler.building.build import BuildReport
+from tiler.building.heightlayers import HeightStamps, Opened, build_from_heights, build_settings
+from tiler.building.layer import Progress
 from tiler.building.placement import Placement
 from tiler.building.plan import Plan
 from tiler.checking.blockreader import BlockReader
-from tiler.cluster.samplecopy import SampleCopy
 from tiler.codecs import BlockFormat, open_codec
 from tiler.filters.cascade import Recipe
 from tiler.filters.kernels import DESIGNS
@@ -31,13 +26,10 @@ from tiler.light.heights import refined_layer
 from tiler.light.lightsource import LightSource, Simulation
 from tiler.light.place import GridPlace, place_of
 from tiler.light.sunposition import refracted_deg, sun_position
-from tiler.stores import Store
-from tiler.stores.dataset import Dataset, read_manifest
-from tiler.stores.locate import open_store
-from tiler.tasks.engine import Engine, LocalEngine
+from tiler.stores.dataset import Dataset
+from tiler.tasks.engine import Engine
 from tiler.tasks.partition import choose_task_side
 from tiler.tasks.records import Partition
-from tiler.tasks.stamps import SourceStamps
 
 _RADIUS: Final = 3
 REFRACTION: Final = 0.13
@@ -55,25 +47,6 @@ class LightReport:
     stages_s: dict[str, float]
 
 
-class HeightStamps(SourceStamps):
-    """The state of the heights, as their dataset knows it: the digest of the index of their finest level."""
-
-    def __init__(self, layer: Layer) -> None:
-        self.stamps = [layer.levels[0].index]
-
-    @property
-    def paths(self) -> list[str]:
-        """No files: the heights lie in the dataset itself."""
-        return []
-
-    def of(self, window: Rect) -> str:
-        """Return the state of all heights: any of them may shade a ``window``."""
-        return digest(self.stamps[0].encode())
-
-    def require_unchanged(self) -> None:
-        """Nothing can change them: this build holds the dataset."""
-
-
 def build_light(
     output: str | Path,
     settings: LightSettings,
@@ -89,41 +62,13 @@ def build_light(
     else can change the heights. Raises NotFoundError without the dataset or its heights, UsageError, InputError or StorageError, and
     MissingExtraError if a time is given and PyEphem is missing.
     """
-    started = perf_counter()
-    store = open_store(output)
-    with store.exclusive(settings.break_lock) as claim:
-        manifest = read_manifest(store)
-        if manifest is None:
-            raise NotFoundError(f"{store.location}: no dataset there; build one with heights first: clipmap build DEM -o {output}")
-        dataset = Dataset(store, manifest)
-        sweep(dataset, claim)
-        settings = choose(dataset, settings)
-        plan, source, stamps = open_light(dataset, settings)
-        try:
-            light = source.simulation.light
-            common = build_settings(settings)
-            intent = decide(store, claim, manifest, plan, stamps, common)
-            if intent.act is None:
-                report = up_to_date(store, claim, manifest, plan, intent, settings.records, started)
-                return LightReport(report, light, {})
-            copy = copy_for(engine, store, intent, plan, stamps)
-            if copy is None or not copy.holds(source):
-                source.bake(on_stage)
-            build = LayerBuild(plan, intent, [], store, claim, manifest, stamps, common, engine or LocalEngine(plan.workers), copy)
-            on_stage("blocks" if copy is None else "copy and blocks")
-            build.run(on_progress)
-            if copy is not None:
-                source.stages_s["copy"] = copy.seconds
-        finally:
-            source.close()
-        return LightReport(report_of(build, intent, claim, perf_counter() - started), light, source.stages_s)
 
+    def opened(dataset: Dataset) -> Opened[LightSource]:
+        chosen = choose(dataset, settings)
+        return *open_light(dataset, chosen), build_settings(chosen)
 
-def copy_for(engine: Engine | None, store: Store, intent: Intent, plan: Plan, stamps: SourceStamps) -> SampleCopy | None:
-    """Return the copy of the samples that an engine needs whose tasks run in other processes; None if they run in this one."""
-    if engine is None or isinstance(engine, LocalEngine):
-        return None
-    return SampleCopy(store, intent.path, "\n".join([plan.digest, json.dumps(plan.place), *stamps.stamps]), plan.workers)
+    report, source = build_from_heights(output, settings.break_lock, opened, on_progress, on_stage, engine)
+    return LightReport(report, source.simulation.light, source.stages_s)
 
 
 def open_light(dataset: Dataset, settings: LightSettings) -> tuple[Plan, LightSource, HeightStamps]:
@@ -178,19 +123,6 @@ def _dtype(settings: LightSettings) -> SampleType:
     if settings.codec.partition(":")[0] == "exr":
         return "float32"
     return "uint16" if settings.bits == 16 else "uint8"
-
-
-def build_settings(settings: LightSettings) -> BuildSettings:
-    """Return what the settings of light say of any build."""
-    return BuildSettings(
-        codec=settings.codec,
-        task=settings.task,
-        workers=settings.workers,
-        overwrite=settings.overwrite,
-        update=settings.update,
-        records=settings.records,
-        break_lock=settings.break_lock,
-    )
 
 
 def plan_light(source: LightSource, light: Light, manifest: Manifest, settings: LightSettings, workers: int) -> Plan:

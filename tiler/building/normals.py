@@ -3,20 +3,17 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from time import perf_counter
 from typing import Final
 
 from schemas.address import LAYER_NAME
-from schemas.errors import NotFoundError, UsageError
+from schemas.errors import UsageError
 from schemas.lattice import Lattice
 from schemas.light import Normals
 from schemas.manifest import Layer, Manifest, SampleType
-from schemas.settings import BuildSettings, NormalSettings
-from tiler.building.build import BuildReport, report_of, up_to_date
-from tiler.building.intent import decide
-from tiler.building.layer import LayerBuild, Progress
-from tiler.building.leftovers import sweep
-from tiler.building.light import HeightStamps, copy_for
+from schemas.settings import NormalSettings
+from tiler.building.build import BuildReport
+from tiler.building.heightlayers import HeightStamps, Opened, build_from_heights, build_settings
+from tiler.building.layer import Progress
 from tiler.building.placement import Placement
 from tiler.building.plan import Plan
 from tiler.checking.blockreader import BlockReader
@@ -26,9 +23,8 @@ from tiler.filters.kernels import DESIGNS
 from tiler.light.heights import refined_layer
 from tiler.light.normals import NormalSource
 from tiler.light.place import place_of
-from tiler.stores.dataset import Dataset, read_manifest
-from tiler.stores.locate import open_store
-from tiler.tasks.engine import Engine, LocalEngine
+from tiler.stores.dataset import Dataset
+from tiler.tasks.engine import Engine
 from tiler.tasks.partition import choose_task_side
 from tiler.tasks.records import Partition
 
@@ -56,39 +52,12 @@ def build_normals(
     as ``build_light`` copies light. Raises NotFoundError without the dataset or its heights, UsageError, InputError or
     StorageError.
     """
-    started = perf_counter()
-    store = open_store(output)
-    with store.exclusive(settings.break_lock) as claim:
-        manifest = read_manifest(store)
-        if manifest is None:
-            raise NotFoundError(f"{store.location}: no dataset there; build one with heights first: clipmap build DEM -o {output}")
-        dataset = Dataset(store, manifest)
-        sweep(dataset, claim)
-        plan, source, stamps = open_normals(dataset, settings)
-        try:
-            normals = _normals_of(plan)
-            build_settings = BuildSettings(**settings.model_dump(include=_SHARED))
-            intent = decide(store, claim, manifest, plan, stamps, build_settings)
-            if intent.act is None:
-                return NormalReport(up_to_date(store, claim, manifest, plan, intent, settings.records, started), normals, {})
-            copy = copy_for(engine, store, intent, plan, stamps)
-            if copy is None or not copy.holds(source):
-                source.bake()
-            engine = engine or LocalEngine(plan.workers)
-            build = LayerBuild(plan, intent, [], store, claim, manifest, stamps, build_settings, engine, copy)
-            build.run(on_progress)
-        finally:
-            source.close()
-        return NormalReport(report_of(build, intent, claim, perf_counter() - started), normals, source.stages_s)
 
+    def opened(dataset: Dataset) -> Opened[NormalSource]:
+        return *open_normals(dataset, settings), build_settings(settings)
 
-_SHARED: Final = {"codec", "task", "workers", "overwrite", "update", "records", "break_lock"}
-
-
-def _normals_of(plan: Plan) -> Normals:
-    if plan.normals is None:
-        raise ValueError("a plan of another kind of layer")
-    return plan.normals
+    report, source = build_from_heights(output, settings.break_lock, opened, on_progress, engine=engine)
+    return NormalReport(report, source.normals, source.stages_s)
 
 
 def open_normals(dataset: Dataset, settings: NormalSettings) -> tuple[Plan, NormalSource, HeightStamps]:

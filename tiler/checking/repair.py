@@ -16,7 +16,7 @@ from schemas.settings import LightSettings, NormalSettings
 from tiler.building.plan import Plan, plan_layer
 from tiler.checking.verify import Checks, verify
 from tiler.samples.opening import open_samples
-from tiler.sources.convert import SampleSource
+from tiler.sources.convert import BakedSource, SampleSource
 from tiler.stores.dataset import Dataset, read_manifest
 from tiler.tasks.cut import Target
 from tiler.tasks.destination import DamagedBlocks
@@ -188,20 +188,18 @@ def _lit_again(dataset: Dataset, settings: LightSettings, workers: int) -> tuple
     """Return the plan of a layer of light and the light itself, simulated anew on the dataset's heights."""
     from tiler.building.light import open_light  # noqa: PLC0415 - a fifth of a second that other layers need not wait for
 
-    plan, source, stamps = open_light(dataset, settings.model_copy(update={"workers": workers}))
-    try:
-        source.bake()
-    except BaseException:
-        source.close()
-        raise
-    return plan, source, stamps
+    return _baked(*open_light(dataset, settings.model_copy(update={"workers": workers})))
 
 
 def _found_again(dataset: Dataset, settings: NormalSettings, workers: int) -> tuple[Plan, SampleSource, SourceStamps]:
     """Return the plan of a layer of normals and the normals themselves, found anew on the dataset's heights."""
     from tiler.building.normals import open_normals  # noqa: PLC0415 - as above
 
-    plan, source, stamps = open_normals(dataset, settings.model_copy(update={"workers": workers}))
+    return _baked(*open_normals(dataset, settings.model_copy(update={"workers": workers})))
+
+
+def _baked(plan: Plan, source: BakedSource, stamps: SourceStamps) -> tuple[Plan, SampleSource, SourceStamps]:
+    """Bake a source, and close it if that fails."""
     try:
         source.bake()
     except BaseException:

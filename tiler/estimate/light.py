@@ -21,7 +21,8 @@ from schemas.estimates import BuildEstimate
 from schemas.lattice import Lattice
 from schemas.region import Rect
 from schemas.settings import LightSettings
-from tiler.building.light import build_settings, open_light
+from tiler.building.heightlayers import build_settings
+from tiler.building.light import open_light
 from tiler.checking.blockreader import BlockReader, DecodedBlock
 from tiler.effects.dataset import place_of_window
 from tiler.estimate.build import Beside, estimate_of

@@ -90,92 +90,6 @@ def _raise_blocks(heights: Float64, size: int, base: float, block: Float64) -> N
 
 
 @compiled
-def _is_shaded(
-    heights: Float32,
-    y: int,
-    x: int,
-    level: float,
-    first_row: int,
-    shift: float,
-    drop: float,
-    slack: float,
-    lift: Lift,
-    peaks: Float64,
-    table: Int64,
-    maxima: Float64,
-) -> bool:
-    """Whether terrain on a row above ``y`` is higher than the ray from (y, x) at ``level``."""
-    last = heights.shape[1] - 1
-    n, k = 0, 1
-    sideways = 1 if shift > 0.0 else -1
-    while k <= y:
-        row = y - k
-        if peaks[row] + slack <= level:
-            return False
-        place = x + shift * k
-        left = math.floor(place)
-        share = place - left
-        column = int(left)
-        if column < 0 or column > last or (column == last and share > 0.0):
-            return False
-        if n >= 0:
-            block_row, cell = row >> (FINEST + n), column >> (FINEST + n)
-            at = table[n, 0] + block_row * table[n, 2]
-            top = maxima[at + cell]
-            beside = cell + sideways
-            if shift != 0.0 and 0 <= beside < table[n, 2]:
-                top = max(top, maxima[at + beside])
-            if top + slack <= level:
-                k = y - (block_row << (FINEST + n)) + 1
-                n = min(n + 1, table.shape[0] - 1)
-            else:
-                n -= 1
-            continue
-        met = _level(heights, row, column, first_row, drop, lift)
-        if share > 0.0:
-            met += share * (_level(heights, row, column + 1, first_row, drop, lift) - met)
-        if met + (first_row + row) * drop > level:
-            return True
-        k += 1
-        if row & ((1 << FINEST) - 1) == 0:
-            n = 0
-    return False
-
-
-@compiled
-def march_undecided(
-    heights: Float32,
-    first_row: int,
-    shift: float,
-    slope: float,
-    step_m: float,
-    bias: float,
-    slack: float,
-    lift: Lift,
-    peaks: Float64,
-    table: Int64,
-    maxima: Float64,
-    codes: Codes,
-) -> int:
-    """Decide the undecided ``codes`` (h, w) of the last h rows of ``heights`` by marching their rays; return how many there were.
-
-    ``first_row`` is the number of the first row of ``heights``; ``slack`` what rounding may add to interpolated heights.
-    """
-    drop = step_m * slope
-    above = heights.shape[0] - codes.shape[0]
-    count = 0
-    for i in range(codes.shape[0]):
-        y = above + i
-        for x in range(codes.shape[1]):
-            if codes[i, x] == UNDECIDED:
-                count += 1
-                level = _level(heights, y, x, first_row, drop, lift) + ((first_row + y) * drop + bias)
-                shaded = _is_shaded(heights, y, x, level, first_row, shift, drop, slack, lift, peaks, table, maxima)
-                codes[i, x] = SHADED if shaded else LIT
-    return count
-
-
-@compiled
 def _horizon(  # noqa: C901 - one loop, and calls in it would not be inlined
     heights: Float32,
     y: int,
@@ -194,7 +108,8 @@ def _horizon(  # noqa: C901 - one loop, and calls in it would not be inlined
 ) -> float:
     """Return how much steeper than the sun's slope the horizon of (y, x) at ``level`` is, 0 if it is not, infinity from ``highest`` on.
 
-    As ``_is_shaded``, with a ray that is lifted to the highest terrain met so far; what it passes above farther on cannot be the horizon.
+    The ray is lifted to the highest terrain met so far; what it passes above farther on cannot be the horizon. With a ``highest`` of 0 it
+    ends at the first terrain that it meets: the sample is shaded.
     """
     last = heights.shape[1] - 1
     n, k = 0, 1
@@ -236,6 +151,39 @@ def _horizon(  # noqa: C901 - one loop, and calls in it would not be inlined
         if row & ((1 << FINEST) - 1) == 0:
             n = 0
     return steeper
+
+
+@compiled
+def march_undecided(
+    heights: Float32,
+    first_row: int,
+    shift: float,
+    slope: float,
+    step_m: float,
+    bias: float,
+    slack: float,
+    lift: Lift,
+    peaks: Float64,
+    table: Int64,
+    maxima: Float64,
+    codes: Codes,
+) -> int:
+    """Decide the undecided ``codes`` (h, w) of the last h rows of ``heights`` by marching their rays; return how many there were.
+
+    ``first_row`` is the number of the first row of ``heights``; ``slack`` what rounding may add to interpolated heights.
+    """
+    drop = step_m * slope
+    above = heights.shape[0] - codes.shape[0]
+    count = 0
+    for i in range(codes.shape[0]):
+        y = above + i
+        for x in range(codes.shape[1]):
+            if codes[i, x] == UNDECIDED:
+                count += 1
+                level = _level(heights, y, x, first_row, drop, lift) + ((first_row + y) * drop + bias)
+                steeper = _horizon(heights, y, x, level, 0.0, first_row, shift, step_m, drop, slack, lift, peaks, table, maxima)
+                codes[i, x] = LIT if steeper == 0.0 else SHADED
+    return count
 
 
 @compiled

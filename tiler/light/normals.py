@@ -2,6 +2,7 @@
 
 import math
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter
 
@@ -56,14 +57,15 @@ class NormalSource:
         self.conversion = Conversion("normal", (0, 1), None, False, None, None, 1.0, 0.0, dtype)
         self.masked = layer.statistics.valid < layer.width * layer.height
         self.stages_s: dict[str, float] = {}
-        self._reader, self._normals, self._cells_m, self._scratch, self._workers = reader, normals, cells_m, scratch, workers
+        self._reader, self.normals, self._cells_m, self._scratch, self._workers = reader, normals, cells_m, scratch, workers
         self._local = threading.local()
         self._grid: HeightGrid | None = None
 
-    def bake(self) -> None:
-        """Decode the heights; raises InputError or StorageError."""
+    def bake(self, on_stage: Callable[[str], None] = lambda name: None) -> None:
+        """Decode the heights; ``on_stage`` is told that this begins. Raises InputError or StorageError."""
+        on_stage("heights")
         started = perf_counter()
-        self._grid = HeightGrid(self._reader, self._scratch, self._workers, self._normals.density)
+        self._grid = HeightGrid(self._reader, self._scratch, self._workers, self.normals.density)
         self.stages_s["heights"] = perf_counter() - started
 
     def read(self, window: Rect) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
@@ -73,7 +75,7 @@ class NormalSource:
         around = self._grid.read_around(window)
         found = np.empty((window.height, window.width, 2), np.float32)
         cells_m = np.ascontiguousarray(self._cells_m[:, window.y0 : window.y1])
-        find_normals(around, cells_m, float(self._normals.zero), float(self._normals.one), found)
+        find_normals(around, cells_m, float(self.normals.zero), float(self.normals.one), found)
         valid = ~np.isnan(around[1:-1, 1:-1])
         if hasher := getattr(self._local, "hasher", None):
             hasher.update(found)

@@ -39,6 +39,17 @@ def gradient(around: Float32, y: int, x: int, cell_x: float, cell_y: float) -> t
 
 
 @compiled
+def _light(facing: float, upright: float, sun: float, sky: float, open_sky: float, bounced: float) -> np.float32:
+    """Return the light of a sample from the shares of sun and sky that it sees; without a ``sky`` (negative) its own slope hides some."""
+    light = max(facing, 0.0) * sun
+    if sky >= 0.0:
+        light += open_sky * sky + bounced * (1.0 - sky)
+    else:
+        light += open_sky * 0.5 * (1.0 + upright)
+    return np.float32(light / (1.0 + open_sky))
+
+
+@compiled
 def shade_window(
     around: Float32,
     cells_m: Float64,
@@ -76,13 +87,8 @@ def shade_window(
                 facing = upright * (slope - (right * east + up * north)) / math.sqrt(1.0 + slope * slope)
             elif slope < 0:
                 facing = 0.0
-            light = max(facing, 0.0) * sun[y, x] * top
-            if has_sky:
-                seen = sky[y, x] * top
-                light += open_sky * seen + bounced * (1.0 - seen)
-            else:
-                light += open_sky * 0.5 * (1.0 + upright)
-            out[y, x] = np.float32(light / (1.0 + open_sky))
+            seen = sky[y, x] * top if has_sky else -1.0
+            out[y, x] = _light(facing, upright, sun[y, x] * top, seen, open_sky, bounced)
 
 
 @compiled
@@ -122,13 +128,8 @@ def shade_patch(
             upright = 1.0 / math.sqrt(1.0 + (right * right + up * up))
             east, north = left[0] + aside * right_end[0], left[1] + aside * right_end[1]
             facing = upright * (left[2] + aside * right_end[2] - (right * east + up * north))
-            light = max(facing, 0.0) * sun[y, x] * top
-            if has_sky:
-                seen = sky[y, x] * top
-                light += open_sky * seen + bounced * (1.0 - seen)
-            else:
-                light += open_sky * 0.5 * (1.0 + upright)
-            out[y, x] = np.float32(light / (1.0 + open_sky))
+            seen = sky[y, x] * top if has_sky else -1.0
+            out[y, x] = _light(facing, upright, sun[y, x] * top, seen, open_sky, bounced)
 
 
 @compiled

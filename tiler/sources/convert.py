@@ -6,6 +6,7 @@ reach any result.
 
 import threading
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
@@ -91,6 +92,16 @@ class SampleSource(Protocol):
 
     def close(self) -> None:
         """Close the file."""
+        ...
+
+
+class BakedSource(SampleSource, Protocol):
+    """Samples that are computed: ``bake`` once before they are read. ``stages_s`` are the seconds that its parts took."""
+
+    stages_s: dict[str, float]
+
+    def bake(self, on_stage: Callable[[str], None] = ...) -> None:
+        """Compute what all samples need; ``on_stage`` is told what begins."""
         ...
 
 
